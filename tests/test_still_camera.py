@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 from posed_clips import PLACES, H, W, panning, sliding, texture
+from scipy.spatial.transform import Rotation
 from test_prepare_footage import work_on
 
 from hdr_nsff.core.errors import InputError
@@ -14,9 +15,12 @@ from hdr_nsff.prepare.work import PrepareConfig
 from hdr_nsff.priors.poses import estimate
 from hdr_nsff.priors.poses.estimate import estimate_poses
 from hdr_nsff.priors.poses.still_camera import (
+    Detail,
     StillCameraTuning,
     nearly_still_shifts,
+    shaken_background,
     shift_of,
+    shifts_if_spread,
     still_camera_shifts,
 )
 from hdr_nsff.radiometry.local_detail import local_detail
@@ -49,6 +53,36 @@ def test_a_still_camera_behind_a_mover_that_fills_the_picture(tmp_path):
     poses = estimate_poses(behind_a_box(), None, tmp_path)
     assert poses.parallax == "none" and poses.registered.all()
     assert np.array_equal(poses.c2w, np.tile(np.eye(4)[:3], (NUM, 1, 1)))
+
+
+def shaken(video: np.ndarray, pixels: float) -> np.ndarray:
+    """The clip (T, H, W, 3) with every second frame shifted to the right."""
+    matrix = np.array([[1, 0, pixels], [0, 1, 0]])
+    moved = [cv2.warpAffine(f, matrix, (W, H), borderMode=cv2.BORDER_REFLECT) for f in video]
+    return np.stack([moved[t] if t % 2 else video[t] for t in range(len(video))])
+
+
+def test_a_camera_that_shakes_behind_a_mover_that_fills_the_picture(tmp_path):
+    still = behind_a_box()
+    box = still.std(0).mean(-1) > 0.05  # where it is at times
+    clip = shaken(still, 1.5)
+    assert still_camera_shifts(clip) is None
+    background = shaken_background(clip)
+    assert background is not None and (background & ~box).sum() > 0.8 * background.sum()
+    poses = estimate_poses(clip, None, tmp_path)
+    assert poses.parallax == "rotation" and poses.registered.all()
+    assert "of the picture, shakes at most" in poses.notes[-1]
+    relative = poses.c2w[:-1, :, :3].transpose(0, 2, 1) @ poses.c2w[1:, :, :3]
+    angles = np.degrees(Rotation.from_matrix(relative).magnitude())
+    focal = poses.K[0, 0, 0]
+    sides = 1 + (W / 2 / focal) ** 2 / 3  # a turn shifts them farther, so much in the mean
+    assert angles == pytest.approx(np.degrees(1.5 / focal / sides), rel=0.1)
+
+
+def test_a_camera_that_moves_farther_does_not_shake():
+    assert shaken_background(shaken(behind_a_box(), 4.0)) is None
+    assert shaken_background(noisy(sliding(PLACES))) is None
+    assert shaken_background(noisy(panning(np.linspace(-4, 4, NUM)))) is None
 
 
 def shaken_below(row: int, above: bool) -> np.ndarray:
@@ -133,6 +167,21 @@ def test_what_hardly_shows_a_background_or_moves_does_not_stand_nearly_still():
 
 def test_a_dashboard_is_no_background():
     assert still_camera_shifts(shaken_below(2 * H // 3, above=False)) is None
+
+
+@pytest.mark.parametrize(("columns", "still"), [(10, True), (60, False)])
+def test_little_that_sways_in_a_quarter_does_not_move_the_camera(columns, still):
+    """Hair sways in the right half, before a wall that shows on the left alone."""
+    background = local_detail(WALL)
+    kept = np.zeros((H, W), bool)
+    kept[:, : W // 2] = True
+    hair = np.s_[-H // 2 :, -columns:]
+    kept[hair] = True
+    frames = np.repeat(background[None], NUM, 0)
+    frames[:, *hair] = np.roll(background, 1, axis=1)[hair]
+    found = Detail(frames, np.ones_like(frames, bool), background, kept, scale=1.0)
+    assert np.median(found.shifts(kept & (np.arange(W) > W // 2))) > 0.8
+    assert (shifts_if_spread(found, StillCameraTuning()) is not None) == still
 
 
 def zoomed(factors: np.ndarray) -> np.ndarray:

@@ -25,7 +25,7 @@ from hdr_nsff.footage.footage import Footage, open_footage
 from hdr_nsff.footage.frame_choice import check_frame_size
 from hdr_nsff.footage.ingest import MAX_FRAMES, read_frames
 from hdr_nsff.footage.timestamps import frame_gaps
-from hdr_nsff.priors.poses.estimate import PosesTuning
+from hdr_nsff.priors.poses.estimate import PosesTuning, shaken_poses
 from hdr_nsff.priors.poses.matching import (
     Keypoints,
     PairMatches,
@@ -288,13 +288,17 @@ def find_motion(
     share = None
     if panorama is not None:
         share = rotation_share(matches, panorama, width, height, rotation)
-    if panorama is None or share is None:
-        hardly_shifts = nearly_still_shifts(equalized, clipped, tuning.still) is not None
-        return ("tripod" if hardly_shifts else "unknown"), None
-    if share < tuning.min_rotation_share or panorama.slides:
+    enough = share is not None and share >= tuning.min_rotation_share
+    if panorama is not None and enough and not panorama.slides:
+        still = panorama.max_displacement < rotation.max_tripod_motion_px
+        return ("tripod" if still else "rotation"), share
+    shaken = shaken_poses(equalized, clipped, clipped, tuning)
+    if shaken is not None:
+        return ("tripod" if shaken.parallax == "none" else "rotation"), None
+    if share is not None:
         return "parallax", share
-    still = panorama.max_displacement < rotation.max_tripod_motion_px
-    return ("tripod" if still else "rotation"), share
+    hardly_shifts = nearly_still_shifts(equalized, clipped, tuning.still) is not None
+    return ("tripod" if hardly_shifts else "unknown"), None
 
 
 def compare_sharpness(

@@ -1,9 +1,9 @@
 """Camera poses from frames alone: structure from motion on exposure-equalized frames
 with moving objects left out.
 
-Footage without parallax is recognized first: a tripod (`still_camera.py`), or a camera
-that turns in place, which gets rotations (`rotation.py`). All other footage goes to
-structure from motion (`reconstruct.py`).
+Footage without parallax is recognized first: a tripod, or a camera that shakes behind
+movers (`still_camera.py`), or one that turns in place; the latter two get rotations
+(`rotation.py`). All other footage goes to structure from motion (`reconstruct.py`).
 Poses are camera to world, OpenCV axes; the world's +z is the mean viewing direction,
 near is 1.
 """
@@ -60,6 +60,7 @@ from hdr_nsff.priors.poses.sfm import LENS_FILE
 from hdr_nsff.priors.poses.still_camera import (
     StillCameraTuning,
     nearly_still_shifts,
+    shaken_background,
     still_camera_shifts,
 )
 from hdr_nsff.priors.poses.view_matches import EarlierRounds
@@ -132,6 +133,8 @@ def estimate_poses(
             share = parallax_free_share(video, ignore, tuning) or 0.0
     if share >= tuning.min_rotation_share:
         poses = rotation_poses(video, ignore, tuning, lens)
+    if poses is None and is_one_camera:
+        poses = shaken_poses(video, ignore, clipped, tuning, lens)
     if poses is None:
         if share >= tuning.no_lens_share and lens == "auto":
             lens = "none"
@@ -313,6 +316,29 @@ def nearly_still_poses(
     """The same where no other poses are found, of a camera that may shake a little."""
     shifts = nearly_still_shifts(video, clipped, tuning.still)
     return None if shifts is None else poses_at_rest(video, shifts, tuning, lens)
+
+
+def shaken_poses(
+    video: ArrayStack,
+    ignore: np.ndarray,
+    clipped: ArrayStack | None,
+    tuning: PosesTuning = PosesTuning(),
+    lens: LensChoice = "none",
+) -> Poses | None:
+    """Poses of a camera that shakes, or turns by as little, behind movers that hide it
+    from `parallax_free_share`: rotations of what keeps its place.
+
+    `video` (T, H, W, 3); `ignore` and `clipped` (T, H, W) bool. None where the camera
+    moves farther, or rotations do not explain what keeps its place.
+    """
+    background = shaken_background(video, clipped, tuning.still)
+    if background is None:
+        return None
+    poses = rotation_poses(video, ignore | ~background, tuning, lens)
+    if poses is None:
+        return None
+    note = f"what keeps its place, {background.mean():.0%} of the picture, shakes at most"
+    return replace(poses, notes=(*poses.notes, note))
 
 
 def poses_at_rest(
