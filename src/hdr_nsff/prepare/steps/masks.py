@@ -43,7 +43,7 @@ def find_masks(work: Work) -> StepResult:
 def estimated_masks(work: Work) -> np.ndarray:
     """Moving masks (T, H, W) from flow and poses; also from the visits of a rig's
     cameras, from the background, where a camera shows it at other times, or from what a
-    camera that stands still never shows again.
+    camera without parallax never shows again.
     """
     evidence = work.visits.distance if work.manifest.rig > 1 else None
     found, valid, pairs = work.raw_flows
@@ -66,11 +66,9 @@ def estimated_masks(work: Work) -> np.ndarray:
     )
     groups = recorded_alike[1].ravel()
     for own in work.camera_frames():  # frames of two cameras are no neighbors
-        if np.allclose(c2w[own], c2w[own][0]):
-            moving[own] = mark_unsteady(moving[own], video[own], groups[own], train[own])
-        moving[own] = correct_by_background(
-            moving[own], video[own], groups[own], train[own], K[own], c2w[own]
-        )
+        clip = video[own], groups[own], train[own], K[own], c2w[own]
+        moving[own] = mark_unsteady(moving[own], *clip)
+        moving[own] = correct_by_background(moving[own], *clip)
     return share_masks(work, moving)
 
 

@@ -199,13 +199,13 @@ def spread(items: list[int], count: int) -> list[int]:
 def align(
     frame: np.ndarray, hidden: np.ndarray, homography: np.ndarray, size: tuple[int, int]
 ) -> np.ndarray:
-    """Another frame's background (H, W, 3) as seen from here; NaN where it is `hidden`
+    """Another frame's background (H, W, C) as seen from here; NaN where it is `hidden`
     (H, W) or outside. `homography` leads from here to there, centers at +0.5.
     """
     to_center = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
     matrix = np.linalg.inv(to_center) @ homography @ to_center  # OpenCV's centers are at 0
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    seen = cv2.warpPerspective(frame, matrix, size, flags=flags)
+    seen = cv2.warpPerspective(frame, matrix, size, flags=flags).reshape(*size[::-1], -1)
     covered = cv2.warpPerspective(
         hidden.astype(np.float32), matrix, size, flags=flags, borderValue=1
     )

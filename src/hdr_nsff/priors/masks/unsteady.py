@@ -1,10 +1,11 @@
-"""Moving masks before a camera that stands still: what never shows the same again.
+"""Moving masks of a camera without parallax: what never shows the same again.
 
 Somebody who sits and talks moves by less than flow can tell from one frame to the next,
 and hides the background at all times, so neither flow nor the background finds him. But
 what is recorded there is different at all times: the typical deviation from the median
 over the clip is large, while it is small where a passer-by hid the background for a
 moment. A region of this kind that flow marks now and then moves at all times.
+Frames of a camera that turns are compared where its middle frame looks.
 """
 
 from __future__ import annotations
@@ -14,7 +15,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from hdr_nsff.core.stack import ArrayStack, spread_frames
-from hdr_nsff.priors.masks.background import SIGMA_PER_MAD, enlarge, resize, working_size
+from hdr_nsff.priors.masks.background import (
+    SIGMA_PER_MAD,
+    align,
+    enlarge,
+    pixel_homography,
+    resize,
+    working_size,
+)
 from hdr_nsff.priors.masks.regions import marked_regions, regions_with_disc, without_specks
 
 
@@ -45,6 +53,32 @@ class UnsteadyTuning:
     """Side of the smallest region."""
     closing_px: int = 5
     """Side of the largest gap that is closed."""
+    alignment_px: float = 0.5
+    """Error of the frames of a camera that turns, which moves edges by as much."""
+    min_seen: float = 0.7
+    """Share of the frames of a camera that turns that must see a pixel."""
+
+
+@dataclass(frozen=True)
+class Views:
+    """How frames of one camera are seen from its middle frame, on a working grid."""
+
+    size: tuple[int, int]  # width, height of the grid
+    homographies: np.ndarray | None  # (T, 3, 3) from there; None: the camera stands still
+
+    def from_middle(self, image: np.ndarray, t: int) -> np.ndarray:
+        """An image (h, w, C) of frame `t`, seen from the middle frame; NaN outside."""
+        if self.homographies is None:
+            return image
+        return align(image, np.zeros(image.shape[:2], np.uint8), self.homographies[t], self.size)
+
+    def from_frame(self, region: np.ndarray, t: int) -> np.ndarray:
+        """A region (h, w) bool of the middle frame as seen from frame `t`."""
+        if self.homographies is None:
+            return region
+        image, inside = region[..., None].astype(np.float32), np.zeros(region.shape, np.uint8)
+        seen = align(image, inside, np.linalg.inv(self.homographies[t]), self.size)
+        return np.asarray(seen[..., 0] > 0.5)
 
 
 def mark_unsteady(
@@ -52,22 +86,40 @@ def mark_unsteady(
     video: ArrayStack,
     groups: np.ndarray,
     sources: np.ndarray,
+    K: np.ndarray,
+    c2w: np.ndarray,
     tuning: UnsteadyTuning = UnsteadyTuning(),
 ) -> np.ndarray:
-    """The moving masks (T, H, W) bool of a camera that stands still, with what is
+    """The moving masks (T, H, W) bool of one camera without parallax, with what is
     unsteady marked at all times.
 
     `video` (T, H, W, 3) is rgb in [0, 1]; frames of one of the `groups` (T,) were
     recorded alike. `sources` (T,) bool: frames that may decide about others; the others
-    are decided about by all.
+    are decided about by all. `K` (T, 3, 3) px; `c2w` (T, 3, 4).
     """
     height, width = moving.shape[1:]
+    views = views_of(working_size((height, width), tuning.working_pixels), (width, height), K, c2w)
     marked = moving.copy()
     for decided, deciding in ((sources, sources), (~sources, np.ones_like(sources))):
-        if decided.any():
-            unsteady = unsteady_regions(moving, video, groups, np.flatnonzero(deciding), tuning)
-            marked[decided] |= enlarge(unsteady, (width, height))
+        if not decided.any():
+            continue
+        frames = np.flatnonzero(deciding)
+        unsteady = unsteady_regions(moving, video, groups, frames, views, tuning)
+        for t in np.flatnonzero(decided).tolist():
+            marked[t] |= enlarge(views.from_frame(unsteady, t), (width, height))
     return marked
+
+
+def views_of(
+    size: tuple[int, int], frame_size: tuple[int, int], K: np.ndarray, c2w: np.ndarray
+) -> Views:
+    """The views on a grid of `size`, for frames of `frame_size` (width, height)."""
+    if np.allclose(c2w, c2w[0]):
+        return Views(size, None)
+    count = len(c2w)
+    shrink = np.array([size[0] / frame_size[0], size[1] / frame_size[1], 1])[:, None]
+    K = np.broadcast_to(K, (count, 3, 3)) * shrink
+    return Views(size, np.stack([pixel_homography(K, c2w, count // 2, t) for t in range(count)]))
 
 
 def unsteady_regions(
@@ -75,29 +127,55 @@ def unsteady_regions(
     video: ArrayStack,
     groups: np.ndarray,
     frames: np.ndarray,
+    views: Views,
     tuning: UnsteadyTuning = UnsteadyTuning(),
 ) -> np.ndarray:
-    """Where the `frames` (F,) are unsteady, (h, w) bool on the working grid."""
-    size = working_size(moving.shape[1:], tuning.working_pixels)
+    """Where `frames` (F,) are unsteady, (h, w) bool as seen from the middle frame."""
+    size, turns = views.size, views.homographies is not None
     unsteady = np.zeros(size[::-1], bool)
     for group in np.unique(groups[frames]):
         alike = frames[groups[frames] == group]
         if len(alike) < tuning.min_frames:
             continue
         chosen = alike[spread_frames(len(alike), tuning.max_frames)]
-        shown = np.stack([resize(np.asarray(video[t]), size, tuning.blur_px) for t in chosen])
-        deviation = typical_deviation(shown)
-        noise = float(np.median(deviation))
-        unsteady |= deviation > max(tuning.min_deviation, tuning.min_noise_ratio * noise)
+        shown = [resize(np.asarray(video[t]), size, tuning.blur_px) for t in chosen]
+        shown = [views.from_middle(image, t) for image, t in zip(shown, chosen, strict=True)]
+        deviation, seen = typical_deviation(
+            np.stack(shown), tuning.min_seen, tuning.alignment_px if turns else 0.0
+        )
+        if seen.any():
+            noise = float(np.median(deviation[seen]))
+            unsteady |= deviation > max(tuning.min_deviation, tuning.min_noise_ratio * noise)
     unsteady = without_specks(unsteady, tuning.opening_px, tuning.closing_px)
-    share = resize(moving[frames].mean(0, dtype=np.float32), size)
+    share = np.zeros(size[::-1], np.float32)
+    for t in frames:
+        mask = resize(moving[t].astype(np.float32), size)
+        share += np.nan_to_num(views.from_middle(mask[..., None], t)[..., 0]) / len(frames)
     regions = marked_regions(unsteady, share, tuning.min_marked)
     return regions & regions_with_disc(regions, regions, tuning.radius_share * size[1])
 
 
-def typical_deviation(frames: np.ndarray) -> np.ndarray:
-    """The standard deviation (H, W) over time of `frames` (F, H, W, 3), from the median
-    deviation of the channel that changes most.
+def typical_deviation(
+    frames: np.ndarray, min_seen: float = 1.0, alignment_px: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """The standard deviation (H, W) over time of `frames` (F, H, W, 3), NaN outside,
+    from the median deviation of the channel that changes most, beyond what edges change
+    that are moved by `alignment_px`; and where (H, W) bool enough frames see a pixel.
+    Elsewhere the deviation is 0.
     """
-    center = np.median(frames, 0)
-    return SIGMA_PER_MAD * np.median(np.abs(frames - center), 0).max(-1)
+    seen = np.isfinite(frames[..., 0]).mean(0) >= min_seen
+    frames = np.where(seen[..., None], frames, 0)
+    center = median_of_seen(frames)
+    deviation = SIGMA_PER_MAD * median_of_seen(np.abs(frames - center))
+    slope = np.hypot(*np.gradient(center, axis=(0, 1)))
+    return np.maximum(deviation - alignment_px * slope, 0).max(-1), seen
+
+
+def median_of_seen(frames: np.ndarray) -> np.ndarray:
+    """The median (H, W, 3) over time of `frames` (F, H, W, 3), NaN outside."""
+    if not np.isnan(frames).any():
+        return np.asarray(np.median(frames, 0))
+    count = np.isfinite(frames).sum(0)[None]
+    ordered = np.sort(frames, 0)  # NaN comes last
+    low, high = (np.take_along_axis(ordered, k, 0)[0] for k in ((count - 1) // 2, count // 2))
+    return np.asarray((low + high) / 2)
