@@ -42,7 +42,8 @@ class RunConfig(PrepareConfig):
     (`train`), EXR sequence, videos and LDR views (`render`), a page to look around in
     (`export`), held-out quality (`evaluate`), report.html. Killed? The same command
     continues where it was. Every option of `prepare` works here too; with `--segment`
-    each part of a long clip is trained on its own, in OUT/segment_00 and so on.
+    each segment of a long clip is trained on its own, in OUT/segment_00 and so on, and
+    where the picture cuts, each part in OUT/part_00 and so on.
     """
 
     out: Positional[Path]
@@ -58,7 +59,7 @@ class RunConfig(PrepareConfig):
     to try things out.
     """
     minutes: float | None = None
-    """Training time instead of the preset's; with --segment of each segment."""
+    """Training time instead of the preset's; of each segment or part."""
     readout: float = 0.0
     """Milliseconds from a rolling shutter's first row to its last (`splat`)."""
     shutter: float = 0.0
@@ -90,11 +91,11 @@ def run_all(config: RunConfig) -> None:
     results: dict[str, Path] = {}
     with writing_to(config.out), lock_output(config.out):
         options = options_for(config)
-        scenes = prepare_scenes(footage)
+        scenes = prepare_scenes(footage, part_cuts=config.truth is None)
         write_json(config.out / OPTIONS, options)
         truth = config.truth or held_out_truth(footage)
         for scene in scenes:
-            if config.segment is None:
+            if scene == footage.out:
                 results = finish_scene(replace(settings, scene=scene, device=device), truth)
                 continue
             say(f"{scene.name}: training")

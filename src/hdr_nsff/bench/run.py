@@ -27,7 +27,7 @@ from hdr_nsff.core.process import peak_memory
 from hdr_nsff.core.progress import say
 from hdr_nsff.core.tensors import to_device
 from hdr_nsff.evaluation.evaluate import evaluate_run
-from hdr_nsff.prepare.prepare import prepare
+from hdr_nsff.prepare.prepare import prepare_scenes
 from hdr_nsff.rendering.stills import device_of
 from hdr_nsff.scene.scene import Frame
 from hdr_nsff.training.run_folder import Run
@@ -43,7 +43,7 @@ def prepare_scene(scene: BenchScene) -> None:
     if scene.footage is None or scene.ready:
         return
     with lock_output(scene.folder, wait=True):
-        prepare(scene.footage)
+        prepare_scenes(scene.footage, part_cuts=False)
 
 
 def do_run(run: BenchRun, views: int, lpips: str | None) -> None:

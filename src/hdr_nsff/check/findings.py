@@ -180,7 +180,8 @@ def judge_camera(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
     if camera.cuts:
         listed = ", ".join(str(cut) for cut in camera.cuts[:6])
         text = f"the clip is cut at frame {listed}"
-        yield Finding("problem", "cuts", text, "use one shot: `prepare --start A --end B`")
+        advice = "`prepare` makes a scene of each part; for one of them, --start A --end B"
+        yield Finding("problem", "cuts", text, advice)
 
 
 def judge_lens(facts: ClipFacts) -> Iterator[Finding]:

@@ -109,6 +109,21 @@ class PictureRanges(Note):
     exposures: list[float]  # EV
 
 
+class ClipPart(Note):
+    """A part of a clip between two cuts: frames of the footage, counted from 0."""
+
+    start: Count
+    end: Count  # the frame to stop before
+
+
+class ClipParts(Note):
+    """`parts.json`: where `prepare` cut a clip, and which frames it was to use."""
+
+    marks = ("choice", "parts")
+    choice: dict[str, int | None]
+    parts: list[ClipPart] = Field(min_length=1)
+
+
 class FlowError(Note):
     """End-point error, in pixels."""
 

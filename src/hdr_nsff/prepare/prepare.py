@@ -19,6 +19,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.hashes import hash_file
 from hdr_nsff.core.io import writing_to
 from hdr_nsff.core.lock import lock_output
+from hdr_nsff.core.notes import ClipPart
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.core.tensors import pick_device
 from hdr_nsff.footage.bars import with_bars
@@ -30,10 +31,11 @@ from hdr_nsff.footage.footage import Footage, open_footage
 from hdr_nsff.footage.frame_choice import check_choice, no_frame
 from hdr_nsff.footage.ingest import FootageFrame, read_frames
 from hdr_nsff.footage.tracks import open_tracks
+from hdr_nsff.prepare.cut_parts import known_parts, part_at_cuts, part_settings
 from hdr_nsff.prepare.engine import found_manifest
 from hdr_nsff.prepare.lens import given_lenses, known_lenses, parse_lens
 from hdr_nsff.prepare.segments import CLIP_FOLDER, check_segments, prepare_segments
-from hdr_nsff.prepare.steps.footage import MIN_FRAMES, check_count
+from hdr_nsff.prepare.steps.footage import MIN_FRAMES, ClipCutsError, check_count
 from hdr_nsff.prepare.steps.neural import check_networks
 from hdr_nsff.prepare.table import STEPS, run_steps
 from hdr_nsff.prepare.work import Part, PrepareConfig, Work
@@ -44,8 +46,8 @@ __all__ = ["STEPS", "PrepareConfig", "prepare"]
 
 
 def prepare(config: PrepareConfig) -> Path:
-    """Run every step that is not done; the scene folder, or with `--segment` the folder
-    of scene folders.
+    """Run every step that is not done; the scene folder, or the folder of scene folders
+    with `--segment` and where the picture cuts.
 
     InputError where the footage or a setting is at fault.
     """
@@ -53,15 +55,25 @@ def prepare(config: PrepareConfig) -> Path:
     return config.out
 
 
-def prepare_scenes(config: PrepareConfig) -> list[Path]:
-    """The same; the scene folders, more than one with `--segment`."""
+def prepare_scenes(config: PrepareConfig, part_cuts: bool = True) -> list[Path]:
+    """The same; the scene folders, more than one with `--segment`, or, with
+    `part_cuts`, one for each part of a clip between two cuts.
+    """
     with writing_to(config.out), lock_output(config.out):
         if config.segment is not None:
             check_segments(config)
             return prepare_segments(begin(replace(config, out=config.out / CLIP_FOLDER)))
+        parts = known_parts(config) if part_cuts else None
+        if parts is not None:
+            return prepare_parts(config, parts)
         work = begin(config)
         report_data_set(work)
-        run_steps(work, STEPS)
+        try:
+            run_steps(work, STEPS)
+        except ClipCutsError as cuts:
+            if not part_cuts:
+                raise
+            return prepare_parts(config, part_at_cuts(work, cuts))
         capture = work.capture
         if capture is not None and capture.has_held_out:
             place = truth_place(config)
@@ -69,6 +81,16 @@ def prepare_scenes(config: PrepareConfig) -> list[Path]:
     sheet = config.out / "contact_sheet.png"
     say(f"scene: {config.out}  ({len(work.manifest.frames)} frames, contact sheet {sheet})")
     return [config.out]
+
+
+def prepare_parts(config: PrepareConfig, parts: list[ClipPart]) -> list[Path]:
+    """The scene folders of a clip's `parts`, each prepared as a clip of its own."""
+    say(f"{config.clip}: the picture cuts; each part becomes a scene of its own")
+    scenes = []
+    for part, settings in zip(parts, part_settings(config, parts), strict=True):
+        say(f"{settings.out.name}: frames {part.start} to {part.end - 1} of the clip")
+        scenes += prepare_scenes(settings, part_cuts=False)
+    return scenes
 
 
 def truth_place(config: PrepareConfig) -> Path:

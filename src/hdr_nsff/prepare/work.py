@@ -51,7 +51,8 @@ class PrepareConfig:
     """Turn alternating-exposure footage into a scene folder.
 
     It holds exposures, poses, optical flow, moving masks and depth. Steps that are done
-    are skipped, so the same command continues where a killed one was.
+    are skipped, so the same command continues where a killed one was. Where the picture
+    cuts, each part becomes a scene folder: OUT/part_00, OUT/part_01 and so on.
     """
 
     clip: Positional[Path]

@@ -245,8 +245,17 @@ def cameras_in_turn(work: Work) -> int:
     return given
 
 
+class ClipCutsError(InputError):
+    """The picture cuts to another scene."""
+
+    def __init__(self, problem: str, first: list[int]) -> None:
+        """`first`: the numbers of the frames after the cuts, in the footage."""
+        super().__init__(problem)
+        self.first = first
+
+
 def check_cuts(work: Work) -> None:
-    """InputError where the picture cuts to another scene."""
+    """ClipCutsError where the picture cuts to another scene."""
     c = work.config
     if work.capture is not None:
         return
@@ -258,9 +267,10 @@ def check_cuts(work: Work) -> None:
         numbers = [all_numbers[own[k]] for k in cuts]
         places = ", ".join(f"{n - c.stride} and {n}" for n in numbers[:MAX_LISTED_CUTS])
         first = numbers[0]
-        raise InputError(
+        raise ClipCutsError(
             f"{c.clip}: the picture cuts between frames {places}; prepare the parts one by "
-            f"one, the first with `--end {first}`, the next with `--start {first}`"
+            f"one, the first with `--end {first}`, the next with `--start {first}`",
+            numbers,
         )
 
 
