@@ -342,11 +342,15 @@ def test_masks_and_depth_that_do_not_fit_are_found_before_flow(
     for i in range(FRAMES):
         write_png(wide / f"{i}.png", np.zeros((34, 61), bool))
         write_png(tmp_path / f"named/{i // 2:03d}.png", np.zeros((34, 60), bool))
+        write_npy(tmp_path / f"tall/{i}.npy", np.ones((35, 60), np.float32))
+        write_npy(tmp_path / f"empty/{i}.npy", np.full((34, 60), i - 8.0, np.float32))
     named = f"{tmp_path / 'named'}: 5 maps for 9 frames, none for 005.png;"
     for option, place, words in (
         ("--mask", wide, f"--mask {wide / '0.png'}: the mask is 61x34"),
         ("--mask", tmp_path / "named", f"--mask {named}"),
         ("--depth", tmp_path / "named", f"--depth {named}"),
+        ("--depth", tmp_path / "tall", "0.npy: a depth map of shape (35, 60)"),
+        ("--depth", tmp_path / "empty", "0.npy: no depth above 0 in this map"),
         ("--mask", wide / "0.png", "0.png: is a file; name the folder that holds it"),
     ):
         assert words in prepared(capsys, folder, option, place)

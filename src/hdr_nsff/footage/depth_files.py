@@ -31,38 +31,42 @@ MIN_DEPTH = 1e-6  # of metric maps: what is nearer is no measurement, and has no
 def read_depth_files(
     files: list[Path], kind: DepthKind, size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Disparity and confidence (T, H, W) of depth maps, one file per frame.
-
-    Files are .npy, EXR or PNG of `size` (H, W), see `read_map`. Where a metric map
-    holds 0 or less, or one of disparity less than 0, nothing was measured: confidence
-    is 0, and disparity that of the pixels around. Elsewhere confidence is 1. InputError
-    for another size, NaN, or an empty map.
+    """Disparity and confidence (T, H, W) of depth maps of `size` (H, W), one file per
+    frame, see `read_depth`.
     """
     disparity = np.zeros((len(files), *size), np.float32)
     confidence = np.ones((len(files), *size), np.float32)
-    maps = [read_map(path, kind == "metric") for path in files]
-    for k, (path, values) in enumerate(zip(files, maps, strict=True)):
-        if values.shape != size:
-            raise InputError(
-                f"{path}: a depth map of shape {values.shape}, the frames need {size}; "
-                "make it at the size of the frames"
-            )
-        if not np.isfinite(values).all():
-            raise InputError(f"{path}: the depth map holds NaN or Inf; {UNKNOWN[kind]}")
-        least = MIN_DEPTH if kind == "metric" else 0
-        if kind != "relative" and not (values > least).any():
-            raise InputError(
-                f"{path}: no depth above 0 in this map; check that its kind is {kind!r}"
-            )
-        if kind == "metric":
-            confidence[k] = known = values > MIN_DEPTH
-            disparity[k] = fill(1 / np.where(known, values, 1), known)
-        elif kind == "disparity":
-            confidence[k] = known = values >= 0  # at 0 it is far away
-            disparity[k] = fill(values, known)
-        else:
-            disparity[k] = values
+    for k, path in enumerate(files):
+        disparity[k], confidence[k] = read_depth(path, kind, size)
     return disparity, confidence
+
+
+def read_depth(path: Path, kind: DepthKind, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Disparity and confidence (H, W) of a depth map: .npy, EXR or PNG of `size` (H,
+    W), see `read_map`.
+
+    Where a metric map holds 0 or less, or one of disparity less than 0, nothing was
+    measured: confidence is 0, and disparity that of the pixels around. Elsewhere
+    confidence is 1. InputError for another size, NaN, or an empty map.
+    """
+    values = read_map(path, kind == "metric")
+    if values.shape != size:
+        raise InputError(
+            f"{path}: a depth map of shape {values.shape}, the frames need {size}; "
+            "make it at the size of the frames"
+        )
+    if not np.isfinite(values).all():
+        raise InputError(f"{path}: the depth map holds NaN or Inf; {UNKNOWN[kind]}")
+    least = MIN_DEPTH if kind == "metric" else 0
+    if kind != "relative" and not (values > least).any():
+        raise InputError(f"{path}: no depth above 0 in this map; check that its kind is {kind!r}")
+    if kind == "relative":
+        return values, np.ones(size, np.float32)
+    if kind == "disparity":
+        known = values >= 0  # at 0 it is far away
+        return fill(values, known), known.astype(np.float32)
+    known = values > MIN_DEPTH
+    return fill(1 / np.where(known, values, 1), known), known.astype(np.float32)
 
 
 def read_map(path: Path, is_metric: bool) -> np.ndarray:

@@ -12,6 +12,7 @@ import numpy as np
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import mask_gray
+from hdr_nsff.footage.depth_files import read_depth
 from hdr_nsff.footage.frame_files import RECORDED, natural_key, sorted_folders
 from hdr_nsff.prepare.work import Work
 
@@ -24,7 +25,9 @@ def check_given_maps(work: Work) -> None:
     if isinstance(work.config.masks, Path):
         user_masks(work, work.config.masks)
     if isinstance(work.config.depth, Path):
-        depth_files(work, work.config.depth)
+        size = (work.manifest.height, work.manifest.width)
+        for path in depth_files(work, work.config.depth):
+            read_depth(path, work.config.depth_kind, size)
 
 
 def user_masks(work: Work, folder: Path) -> np.ndarray:
