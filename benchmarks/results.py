@@ -295,8 +295,7 @@ SECTIONS = (
         "Methods compared: one moving camera, footage alone",
         "Rendered scenes of 160x90 pixels and 36 frames; held-out views of other poses and "
         "times. One minute on one thread is far from the hours that `nsff`, `nerf-wt` and "
-        "`hdr-hexplane` are made for. `nsff` is of before its terms weighed as in the published "
-        "code.",
+        "`hdr-hexplane` are made for. Another program ran on the other core.",
         "hdr-nsff bench OUT --scenes interior,lamp,night,cloth --methods "
         "splat,grid,nsff,nerf-wt,hdr-hexplane --budget 1min --views 0 --jobs 1",
         bench_scores,
