@@ -8,7 +8,6 @@ from hdr_nsff.priors.masks.regions import marked_regions, regions_with_disc, wit
 from hdr_nsff.priors.masks.unsteady import (
     UnsteadyTuning,
     mark_unsteady,
-    median_of_seen,
     typical_deviation,
 )
 
@@ -166,12 +165,11 @@ def test_what_changes_always_is_found_before_a_camera_that_turns():
         for images in (video, before, truth):
             seen = cv2.warpPerspective(images[t].astype(np.float32), to_pixels, (W, H))
             images[t] = seen > 0.5 if images.dtype == bool else seen
-    marked = mark_unsteady(before, video, ONE_GROUP, ALL, K, c2w)
-    overlap = (marked & truth).sum() / (marked | truth).sum()
-    assert overlap > 0.8
+    wide = UnsteadyTuning(max_turn_share=0.2)  # corners move by 0.07 of the width
+    marked = mark_unsteady(before, video, ONE_GROUP, ALL, K, c2w, wide)
+    assert (marked & truth).sum() / (marked | truth).sum() > 0.8
     assert mark_unsteady(before, video, ONE_GROUP, ALL, K, STILL).sum() != marked.sum()
-    seldom = UnsteadyTuning(min_seen=1.01)
-    assert (mark_unsteady(before, video, ONE_GROUP, ALL, K, c2w, seldom) == before).all()
+    assert (mark_unsteady(before, video, ONE_GROUP, ALL, K, c2w) == before).all()
 
 
 def test_edges_of_frames_that_are_not_well_aligned_are_steady():
@@ -179,9 +177,3 @@ def test_edges_of_frames_that_are_not_well_aligned_are_steady():
     shifted = np.stack([ramp + (-1) ** t * 0.4 / (W - 1) for t in range(T)])
     assert typical_deviation(shifted)[0].max() > 0.009
     assert typical_deviation(shifted, alignment_px=0.6)[0].max() < 1e-9
-
-
-def test_a_median_of_what_is_seen():
-    values = np.random.default_rng(0).normal(size=(7, 4, 5, 3))
-    values[2:4, :2] = np.nan
-    assert np.array_equal(median_of_seen(values), np.nanmedian(values, 0))

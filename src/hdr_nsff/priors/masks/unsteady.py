@@ -5,7 +5,7 @@ and hides the background at all times, so neither flow nor the background finds 
 what is recorded there is different at all times: the typical deviation from the median
 over the clip is large, while it is small where a passer-by hid the background for a
 moment. A region of this kind that flow marks now and then moves at all times.
-Frames of a camera that turns are compared where its middle frame looks.
+Frames of a camera that turns a little are compared as its middle frame sees them.
 """
 
 from __future__ import annotations
@@ -55,8 +55,11 @@ class UnsteadyTuning:
     """Side of the largest gap that is closed."""
     alignment_px: float = 0.5
     """Error of the frames of a camera that turns, which moves edges by as much."""
-    min_seen: float = 0.7
-    """Share of the frames of a camera that turns that must see a pixel."""
+    max_turn_share: float = 0.05
+    """Of the picture's width, by which a turn may move a corner: beyond, frames are not
+    aligned well enough. (A man in a car: 0.006; four pans past traffic, where static
+    signs and plants would be marked: 0.1 to 0.17.)
+    """
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,16 @@ class Views:
 
     size: tuple[int, int]  # width, height of the grid
     homographies: np.ndarray | None  # (T, 3, 3) from there; None: the camera stands still
+
+    def turn_share(self) -> float:
+        """The farthest that a corner moves from the middle frame, of the width."""
+        if self.homographies is None:
+            return 0.0
+        width, height = self.size
+        corners = np.array([[x, y, 1.0] for x in (0, width) for y in (0, height)])
+        seen = corners @ self.homographies.transpose(0, 2, 1)
+        moved = seen[..., :2] / seen[..., 2:] - corners[:, :2]
+        return float(np.linalg.norm(moved, axis=-1).max()) / width
 
     def from_middle(self, image: np.ndarray, t: int) -> np.ndarray:
         """An image (h, w, C) of frame `t`, seen from the middle frame; NaN outside."""
@@ -99,6 +112,8 @@ def mark_unsteady(
     """
     height, width = moving.shape[1:]
     views = views_of(working_size((height, width), tuning.working_pixels), (width, height), K, c2w)
+    if views.turn_share() > tuning.max_turn_share:
+        return moving
     marked = moving.copy()
     for decided, deciding in ((sources, sources), (~sources, np.ones_like(sources))):
         if not decided.any():
@@ -140,9 +155,8 @@ def unsteady_regions(
         chosen = alike[spread_frames(len(alike), tuning.max_frames)]
         shown = [resize(np.asarray(video[t]), size, tuning.blur_px) for t in chosen]
         shown = [views.from_middle(image, t) for image, t in zip(shown, chosen, strict=True)]
-        deviation, seen = typical_deviation(
-            np.stack(shown), tuning.min_seen, tuning.alignment_px if turns else 0.0
-        )
+        alignment = tuning.alignment_px if turns else 0.0
+        deviation, seen = typical_deviation(np.stack(shown), alignment)
         if seen.any():
             noise = float(np.median(deviation[seen]))
             unsteady |= deviation > max(tuning.min_deviation, tuning.min_noise_ratio * noise)
@@ -156,26 +170,16 @@ def unsteady_regions(
 
 
 def typical_deviation(
-    frames: np.ndarray, min_seen: float = 1.0, alignment_px: float = 0.0
+    frames: np.ndarray, alignment_px: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """The standard deviation (H, W) over time of `frames` (F, H, W, 3), NaN outside,
     from the median deviation of the channel that changes most, beyond what edges change
-    that are moved by `alignment_px`; and where (H, W) bool enough frames see a pixel.
+    that are moved by `alignment_px`; and where (H, W) bool all frames see a pixel.
     Elsewhere the deviation is 0.
     """
-    seen = np.isfinite(frames[..., 0]).mean(0) >= min_seen
+    seen = np.isfinite(frames[..., 0]).all(0)
     frames = np.where(seen[..., None], frames, 0)
-    center = median_of_seen(frames)
-    deviation = SIGMA_PER_MAD * median_of_seen(np.abs(frames - center))
+    center = np.median(frames, 0)
+    deviation = SIGMA_PER_MAD * np.median(np.abs(frames - center), 0)
     slope = np.hypot(*np.gradient(center, axis=(0, 1)))
     return np.maximum(deviation - alignment_px * slope, 0).max(-1), seen
-
-
-def median_of_seen(frames: np.ndarray) -> np.ndarray:
-    """The median (H, W, 3) over time of `frames` (F, H, W, 3), NaN outside."""
-    if not np.isnan(frames).any():
-        return np.asarray(np.median(frames, 0))
-    count = np.isfinite(frames).sum(0)[None]
-    ordered = np.sort(frames, 0)  # NaN comes last
-    low, high = (np.take_along_axis(ordered, k, 0)[0] for k in ((count - 1) // 2, count // 2))
-    return np.asarray((low + high) / 2)
