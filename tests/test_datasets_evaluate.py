@@ -246,7 +246,7 @@ def test_run_measures_on_what_the_data_set_held_out(
 ) -> None:
     run, seen = fake_run(tmp_path / "run"), []
 
-    def prepare_scenes(config: PrepareConfig) -> list[Path]:
+    def prepare_scenes(config: PrepareConfig, part_cuts: bool) -> list[Path]:
         place = config.out.with_name("scene_truth")
         write_json(place / "made_of.json", {"key": ""})
         write_truth(place, run, radiance="")
