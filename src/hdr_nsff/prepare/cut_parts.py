@@ -16,11 +16,11 @@ from hdr_nsff.core import notes
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.notes import ClipPart, ClipParts
 from hdr_nsff.core.progress import say
+from hdr_nsff.prepare.segments import MIN_FRAMES
 from hdr_nsff.prepare.steps.footage import ClipCutsError
 from hdr_nsff.prepare.work import PrepareConfig, Work
 
 PARTS = "parts.json"
-MIN_FRAMES = 12  # of a part: fewer show little motion (hand-chosen, as of segments)
 
 
 def known_parts(config: PrepareConfig) -> list[ClipPart] | None:

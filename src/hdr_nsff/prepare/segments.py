@@ -37,7 +37,8 @@ from hdr_nsff.scene.manifest import FlowFiles, FrameEntry, Manifest
 CLIP_FOLDER = "clip"  # of what is found once
 MAX_SECONDS = 1e6  # of a segment: eleven days
 MIN_OVERLAP = 3  # frames; more where the exposure cycle is longer (hand-chosen)
-MIN_FRAMES = 12  # of a segment: fewer show little motion (hand-chosen, as in `check`)
+# of a segment or a part between cuts: fewer show little motion (hand-chosen)
+MIN_FRAMES = 12
 OF_CLIP: tuple[StepName, ...] = ("frames", "exposure", "flow", "poses")
 BEFORE_RESPONSE: tuple[StepName, ...] = ("masks", "static_depth")
 AFTER_RESPONSE: tuple[StepName, ...] = ("refined_flow", "movers", "depth", "sheet")
