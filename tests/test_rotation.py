@@ -1,25 +1,18 @@
-"""Cameras without parallax: rotations, their derivatives, and what is no rotation."""
+"""Cameras without parallax: turns, their focal length, and what is no turn."""
 
 import numpy as np
 import pytest
-from posed_clips import FOCAL, H, W, seen, texture
+from posed_clips import H, W, seen, texture
 from scipy.spatial.transform import Rotation
 
 from hdr_nsff.priors.poses.matching import PairMatches, detect_keypoints, match_pairs, view_pairs
 from hdr_nsff.priors.poses.rotation import (
-    MAD_TO_SIGMA,
-    RotationMatches,
-    RotationTuning,
     default_focal,
     field_of_view,
     fit_panorama,
-    normal_equations,
-    refine,
-    rotate_pixels,
-    rotate_pixels_jacobian,
     rotation_up_to_scale,
-    solve_damped,
 )
+from hdr_nsff.priors.poses.rotation_adjustment import rotate_pixels
 
 
 def test_a_slide_past_a_flat_wall_is_no_turn():
@@ -64,42 +57,6 @@ def test_the_default_field_of_view_is_across_the_longer_side(width: int, height:
     panorama = fit_panorama(turn_of(200.0, width, height, 0.3), 8, width, height)
     assert panorama is not None and not panorama.focal_known and panorama.focal == focal
     assert field_of_view(focal, width, height) == pytest.approx(60)
-
-
-def test_derivatives_of_turned_pixels_agree_with_differences():
-    rng = np.random.default_rng(0)
-    rotations = Rotation.from_rotvec(0.1 * rng.normal(size=(2, 3))).as_matrix()
-    frames, p = np.tile([0, 1], (5, 1)), rng.uniform(-40, 40, (5, 2))
-    before, rays = rotate_pixels(rotations, FOCAL, frames, p)
-    exact = rotate_pixels_jacobian(rotations, FOCAL, frames, p, rays)
-    step = 1e-6
-    for k in range(7):
-        moved, focal = rotations.copy(), FOCAL
-        if k < 6:
-            turn = Rotation.from_rotvec(step * np.eye(3)[k % 3]).as_matrix()
-            moved[k // 3] = moved[k // 3] @ turn
-        else:
-            focal = FOCAL * np.exp(step)
-        slope = (rotate_pixels(moved, focal, frames, p)[0] - before) / step
-        assert np.allclose(exact[:, :, k], slope, atol=1e-2)
-
-
-def test_steps_and_the_deviation_of_the_focal_length_are_those_of_the_inverse():
-    rng = np.random.default_rng(0)
-    rotations = Rotation.from_rotvec(0.1 * rng.normal(size=(8, 3))).as_matrix()
-    frames = np.array([(i, j) for i in range(8) for j in range(i) for _ in range(10)])
-    p = rng.uniform(-40, 40, (len(frames), 2))
-    noise = rng.normal(size=p.shape)
-    q = rotate_pixels(rotations, FOCAL, frames, p)[0] + noise
-    error = MAD_TO_SIGMA * np.median(np.linalg.norm(noise, axis=1))
-    for free_focal in (False, True):
-        matches = RotationMatches(frames, p, q)
-        normal, right = normal_equations(rotations, FOCAL, matches, free_focal)
-        exact = np.linalg.inv(normal + 0.1 * np.diag(np.diag(normal))) @ right
-        assert np.allclose(solve_damped(normal, 0.1, right), exact, rtol=1e-8, atol=1e-12)
-        found = refine(rotations, FOCAL, matches, free_focal, RotationTuning(max_iterations=0))
-        variance = np.linalg.inv(normal)[-1, -1] * RotationTuning().matches_per_point
-        assert np.isclose(found.log_focal_deviation, error * np.sqrt(variance), rtol=1e-8)
 
 
 def test_random_matches_give_no_panorama():

@@ -1,11 +1,11 @@
 """The least-squares problem of bundle adjustment for one mover.
 
 Unknowns are canonical points and the rotation and translation of every time, observed
-by tracks in cameras with known poses. Levenberg-Marquardt with the points eliminated
-(Schur complement; Triggs et al., "Bundle adjustment: a modern synthesis", 1999) and
-Huber weights. Weak priors hold what the tracks leave open: the mean z-depth of every
-time, the third differences of the path, whose covariance is estimated from the path,
-the second differences of the rotation, and the extent of the shape.
+by tracks in cameras with known poses. Levenberg-Marquardt, whose steps are those of
+`bundle_steps.py`, with Huber weights. Weak priors hold what the tracks leave open: the
+mean z-depth of every time, the third differences of the path, whose covariance is
+estimated from the path, the second differences of the rotation, and the extent of the
+shape.
 
 All points and translations are relative to the group's center, in scene units.
 """
@@ -15,19 +15,19 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.linalg import LinAlgError
 from scipy.spatial.transform import Rotation
 
 from hdr_nsff.geometry import pinhole
 from hdr_nsff.maths.differences import differences
 from hdr_nsff.priors.movers import bundle_kernels as kernels
+from hdr_nsff.priors.movers.bundle_steps import NormalEquations, solve_damped
 from hdr_nsff.priors.movers.rigid_motion import RigidGroup, canonical_points
 from hdr_nsff.priors.movers.tracks import Tracks
 from hdr_nsff.priors.movers.tuning import BUNDLE_TUNING, BundleTuning
 
 # observations that a point needs; one leaves its depth open
 MIN_OBSERVATIONS = 2
-TRACKS_TOGETHER = 16  # in one product of the Schur complement
 
 
 @dataclass(frozen=True)
@@ -71,25 +71,10 @@ class PriorResiduals:
 
 
 @dataclass(frozen=True)
-class NormalEquations:
-    """Blocks of the Gauss-Newton approximation, and gradients of the cost.
-
-    Point n and the poses share `points_poses[n]` and, since the size of a shape grows
-    with its distance, the product of `by_size[n]` and `by_distance`.
-    """
-
-    poses: np.ndarray  # (6 T, 6 T); six unknowns a time: rotation vector, translation
-    points: np.ndarray  # (N, 3, 3)
-    points_poses: np.ndarray  # (N, 3, 6 T), 0 where not visible
-    by_size: np.ndarray  # (N, 3)
-    by_distance: np.ndarray  # (6 T,)
-    pose_gradient: np.ndarray  # (6 T,)
-    point_gradient: np.ndarray  # (N, 3)
-
-
-@dataclass(frozen=True)
 class ReprojectionTerms:
-    """The same of the reprojection errors alone, a block for every time."""
+    """Terms of `NormalEquations`, of the reprojection errors alone: a block for every
+    time.
+    """
 
     pose_blocks: np.ndarray  # (T, 6, 6)
     points: np.ndarray  # (N, 3, 3)
@@ -407,55 +392,3 @@ def turn_differences(when: np.ndarray, known: np.ndarray) -> np.ndarray:
     for row, k in zip(rows, firsts, strict=True):
         row[k : k + 2] = np.array([-1, 1]) / steps[k : k + 2] * steps[k : k + 2].mean()
     return rows
-
-
-def solve_damped(
-    equations: NormalEquations, visible: np.ndarray, damping: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """The steps (6 T,) of the poses and (N, 3) of the points, by the Schur complement.
-
-    The diagonals grow by the share `damping`; `visible` (N, T) of the tracks.
-    LinAlgError where the poses stay undetermined.
-    """
-    poses, points = equations.poses.copy(), equations.points.copy()
-    size = len(poses)
-    poses[np.diag_indices(size)] *= 1 + damping
-    poses[np.diag_indices(size)] += 1e-9 * np.trace(poses) / size + 1e-12
-    points[:, np.arange(3), np.arange(3)] *= 1 + damping
-
-    inverse = np.linalg.inv(points)
-    subtract_carried(poses, equations.points_poses, inverse, visible)
-    couplings = equations.points_poses.reshape(-1, size)  # (3 N, 6 T)
-    sizes, distance = equations.by_size, equations.by_distance
-    solved_sizes = (inverse @ sizes[..., None])[..., 0]  # (N, 3)
-    carried_sizes = solved_sizes.reshape(-1) @ couplings
-    half = np.outer(carried_sizes + 0.5 * (sizes * solved_sizes).sum() * distance, distance)
-    poses -= half + half.T
-    solved = (inverse @ equations.point_gradient[..., None])[..., 0]  # (N, 3)
-    carried = solved.reshape(-1) @ couplings + distance * (sizes * solved).sum()
-    factor = cho_factor(poses, lower=True, overwrite_a=True, check_finite=False)
-    pose_step = cho_solve(factor, carried - equations.pose_gradient, check_finite=False)
-    remaining = equations.point_gradient + (couplings @ pose_step).reshape(-1, 3)
-    remaining += sizes * (distance @ pose_step)
-    return pose_step, -(inverse @ remaining[..., None])[..., 0]
-
-
-def subtract_carried(
-    poses: np.ndarray, points_poses: np.ndarray, inverse: np.ndarray, visible: np.ndarray
-) -> None:
-    """Subtract from `poses` (6 T, 6 T) what points carry from pose to pose: the sum of
-    W_n^T P_n W_n, W_n of `points_poses` (N, 3, 6 T) and P_n of `inverse` (N, 3, 3).
-
-    Tracks that start at about the same time go together, so that short ones cost only
-    the times at which they are `visible` (N, T).
-    """
-    order = np.argsort(visible.argmax(1), kind="stable")
-    for first in range(0, len(order), TRACKS_TOGETHER):
-        chosen = order[first : first + TRACKS_TOGETHER]
-        times = np.nonzero(visible[chosen].any(0))[0]
-        if len(times):
-            span = slice(6 * times[0], 6 * times[-1] + 6)
-            block = points_poses[chosen, :, span]
-            width = block.shape[2]
-            solved = (inverse[chosen] @ block).reshape(-1, width)
-            poses[span, span] -= block.reshape(-1, width).T @ solved

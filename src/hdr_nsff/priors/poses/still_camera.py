@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from hdr_nsff.core.stack import ArrayStack, spread_frames
-from hdr_nsff.priors.poses.rotation import MAD_TO_SIGMA
+from hdr_nsff.priors.poses.rotation_adjustment import MAD_TO_SIGMA
 from hdr_nsff.radiometry.local_detail import LocalDetailTuning, local_detail
 
 MAX_SHIFT_ROUNDS = 5  # of reweighting
