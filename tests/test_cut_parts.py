@@ -16,10 +16,15 @@ from hdr_nsff.core.images import write_png
 from hdr_nsff.footage.cuts import find_cuts
 from hdr_nsff.pipeline import RunConfig
 from hdr_nsff.prepare import cut_parts, prepare
+from hdr_nsff.prepare.engine import Step
 from hdr_nsff.prepare.prepare import STEPS, PrepareConfig, prepare_scenes
+from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.steps import footage as on_footage
 from hdr_nsff.prepare.steps.footage import ClipCutsError
+from hdr_nsff.prepare.work import Work
+from hdr_nsff.radiometry.response import Response, Source
 from hdr_nsff.scene.manifest import Manifest, StepRecord
+from hdr_nsff.scene.response import write_response
 from hdr_nsff.training.config import TrainConfig
 
 PAN = panning(np.linspace(0, 8, 40))
@@ -70,6 +75,54 @@ def test_each_part_between_two_cuts_becomes_a_scene(
 
     monkeypatch.setattr(on_footage, "find_cuts", detect_again)
     assert prepare_scenes(config) == scenes
+
+
+def response_step(ev: list[float], source: Source) -> Step:
+    """A step that finds the exposures `ev` of brackets."""
+    x = np.linspace(0, 1, 256) ** 2.2
+    y = np.tile(x ** (1 / 2.2), (1, 3, 1))
+    response = Response(
+        x, y, np.array(ev), np.zeros((1, 3)), source, 0.01, 4000, guessed=True, own_curves=()
+    )
+
+    def find(work: Work) -> StepResult:
+        return StepResult(
+            note="",
+            manifest={"response": "response.json"},
+            files={"response.json": lambda path: write_response(path, response)},
+        )
+
+    return Step(find, needs=("exposure",))
+
+
+@pytest.mark.parametrize("source", ["static points", "brightness"])
+def test_shorter_parts_take_the_exposures_that_points_of_the_longest_showed(
+    source: Source, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps = {"response": response_step([0.0, 1.3, 2.0], source)}
+    monkeypatch.setattr(prepare, "STEPS", {**prepare.STEPS, **steps})
+    config = PrepareConfig(clip_of(tmp_path / "clip", 14, 20), tmp_path / "out")
+    short, long = map(Manifest.load, prepare_scenes(config))
+    assert {f.ev for f in long.frames} == {None}
+    if source == "brightness":
+        assert {f.ev for f in short.frames} == {None}
+        return
+    ev = [f.ev for f in short.frames if f.ev is not None]
+    assert np.array(ev) - ev[0] == pytest.approx([(0, 1.3, 2)[t % 3] for t in range(14)])
+    redone = [f.source for scene in prepare_scenes(config) for f in Manifest.load(scene).frames]
+    assert len(redone) == 34
+
+
+def test_parts_that_alternate_otherwise_find_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps = {"response": response_step([0.0, 1.3, 2.0], "static points")}
+    monkeypatch.setattr(prepare, "STEPS", {**prepare.STEPS, **steps})
+    clip = clip_of(tmp_path / "clip", 14, 20)
+    for t in range(14):  # in the opposite order
+        write_png(clip / f"{t:03d}.png", GAINS[::-1][t % 3] * PAN[t])
+    short, _ = map(Manifest.load, prepare_scenes(PrepareConfig(clip, tmp_path / "out")))
+    assert {f.ev for f in short.frames} == {None}
 
 
 def test_parts_of_other_frames_are_refused(tmp_path: Path) -> None:

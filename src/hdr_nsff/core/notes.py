@@ -114,6 +114,9 @@ class ClipPart(Note):
 
     start: Count
     end: Count  # the frame to stop before
+    # which exposure a frame has, 0 the darkest, by its number modulo the cycle; empty
+    # where exposures do not alternate
+    cycle: list[Count] = []
 
 
 class ClipParts(Note):

@@ -1,8 +1,9 @@
 """A clip in which the picture cuts, as parts: a scene folder for what lies between two
 cuts.
 
-Parts share nothing, each has exposures, poses and a response of its own. `parts.json`
-keeps where they begin, so the same command continues with them.
+Each part has poses and a response of its own. Where its exposures alternate as those of
+the longest part do, it takes what was found there: a short part shows less of them.
+`parts.json` keeps where the parts begin, so the same command continues with them.
 """
 
 from __future__ import annotations
@@ -19,6 +20,9 @@ from hdr_nsff.core.progress import say
 from hdr_nsff.prepare.segments import MIN_FRAMES
 from hdr_nsff.prepare.steps.footage import ClipCutsError
 from hdr_nsff.prepare.work import PrepareConfig, Work
+from hdr_nsff.radiometry import exposure_cycle as exposure
+from hdr_nsff.scene.manifest import Manifest
+from hdr_nsff.scene.response import read_response
 
 PARTS = "parts.json"
 
@@ -65,9 +69,9 @@ def part_at_cuts(work: Work, cuts: ClipCutsError) -> list[ClipPart]:
     numbers = work.frame_numbers()
     parts = []
     for start, end in pairwise([numbers[0], *cuts.first, numbers[-1] + 1]):
-        count = sum(start <= number < end for number in numbers)
-        if count >= MIN_FRAMES:
-            parts.append(ClipPart(start=start, end=end))
+        own = [k for k, number in enumerate(numbers) if start <= number < end]
+        if len(own) >= MIN_FRAMES:
+            parts.append(ClipPart(start=start, end=end, cycle=cycle_of(work, own)))
         else:
             say(f"{c.clip}: frames {start} to {end - 1} are left out, too few for a scene")
     if not parts:
@@ -76,6 +80,39 @@ def part_at_cuts(work: Work, cuts: ClipCutsError) -> list[ClipPart]:
     (work.folder / "scene.json").unlink()
     shutil.rmtree(work.folder / "images")
     return parts
+
+
+def cycle_of(work: Work, own: list[int]) -> list[int]:
+    """The cycle of the frames `own`, as `ClipPart` has it; empty for a stride."""
+    found = exposure.detect_cycle(work.video[own])
+    if found.length == 1 or work.config.stride > 1:
+        return []
+    first = work.frame_numbers()[own[0]]
+    brackets = [found.brackets[(n - first) % found.length] for n in range(found.length)]
+    return [found.order.index(bracket) for bracket in brackets]
+
+
+def longest(parts: list[ClipPart]) -> int:
+    """The part with the most frames."""
+    return max(range(len(parts)), key=lambda k: parts[k].end - parts[k].start)
+
+
+def with_exposures_of(scene: Path, part: ClipPart, settings: PrepareConfig) -> PrepareConfig:
+    """The `settings` of a `part` with the exposures that static points showed in the
+    `scene` of another one, in the cycle of `part`.
+
+    As they are where exposures are given, or nothing showed them.
+    """
+    m = Manifest.load(scene)
+    if m.response is None or m.steps["exposure"].provenance == "given":
+        return settings
+    response = read_response(scene / m.response, 1, len(m.bracket_ev))
+    if response.source != "static points" or len(response.ev) != max(part.cycle) + 1:
+        return settings
+    ev = sorted(float(value) for value in response.ev)
+    listed = ",".join(f"{ev[level]:.4f}" for level in part.cycle)
+    say(f"{settings.out.name}: exposures of {listed} EV in turn, as found in {scene.name}")
+    return replace(settings, exposures=None, ev=listed)
 
 
 def part_settings(config: PrepareConfig, parts: list[ClipPart]) -> list[PrepareConfig]:

@@ -31,7 +31,13 @@ from hdr_nsff.footage.footage import Footage, open_footage
 from hdr_nsff.footage.frame_choice import check_choice, no_frame
 from hdr_nsff.footage.ingest import FootageFrame, read_frames
 from hdr_nsff.footage.tracks import open_tracks
-from hdr_nsff.prepare.cut_parts import known_parts, part_at_cuts, part_settings
+from hdr_nsff.prepare.cut_parts import (
+    known_parts,
+    longest,
+    part_at_cuts,
+    part_settings,
+    with_exposures_of,
+)
 from hdr_nsff.prepare.engine import found_manifest
 from hdr_nsff.prepare.lens import given_lenses, known_lenses, parse_lens
 from hdr_nsff.prepare.segments import CLIP_FOLDER, check_segments, prepare_segments
@@ -84,13 +90,20 @@ def prepare_scenes(config: PrepareConfig, part_cuts: bool = True) -> list[Path]:
 
 
 def prepare_parts(config: PrepareConfig, parts: list[ClipPart]) -> list[Path]:
-    """The scene folders of a clip's `parts`, each prepared as a clip of its own."""
+    """The scene folders of a clip's `parts`, each prepared as a clip of its own, the
+    longest first.
+    """
     say(f"{config.clip}: the picture cuts; each part becomes a scene of its own")
-    scenes = []
-    for part, settings in zip(parts, part_settings(config, parts), strict=True):
-        say(f"{settings.out.name}: frames {part.start} to {part.end - 1} of the clip")
-        scenes += prepare_scenes(settings, part_cuts=False)
-    return scenes
+    settings = part_settings(config, parts)
+    first = longest(parts)
+    scenes: dict[int, list[Path]] = {}
+    for k in (first, *(k for k in range(len(parts)) if k != first)):
+        part, own = parts[k], settings[k]
+        say(f"{own.out.name}: frames {part.start} to {part.end - 1} of the clip")
+        if k != first and part.cycle and part.cycle == parts[first].cycle:
+            own = with_exposures_of(settings[first].out, part, own)
+        scenes[k] = prepare_scenes(own, part_cuts=False)
+    return [scene for k in range(len(parts)) for scene in scenes[k]]
 
 
 def truth_place(config: PrepareConfig) -> Path:
