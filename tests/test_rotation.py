@@ -10,19 +10,24 @@ from hdr_nsff.priors.poses.rotation import (
     default_focal,
     field_of_view,
     fit_panorama,
+    rotation_share,
     rotation_up_to_scale,
 )
 from hdr_nsff.priors.poses.rotation_adjustment import rotate_pixels
 
 
-def test_a_slide_past_a_flat_wall_is_no_turn():
+def test_a_slide_past_a_flat_wall_is_a_turn_behind_a_long_lens() -> None:
+    """Every match is explained, but not by the default lens."""
     wall = texture(0, 400, 240)
     slide = np.stack(
         [seen(wall, np.array([[1, 0, -200 + 8.0 * t], [0, 1, -70], [0, 0, 1]])) for t in range(8)]
     )
     keypoints = detect_keypoints(slide, np.zeros((8, H, W), bool))
     matches = match_pairs(keypoints, view_pairs([list(range(8))]))
-    assert fit_panorama(matches, 8, W, H).slides
+    panorama = fit_panorama(matches, 8, W, H)
+    assert panorama is not None and panorama.long_lens and not panorama.focal_known
+    assert field_of_view(panorama.focal, W, H) == pytest.approx(10)
+    assert rotation_share(matches, panorama, W, H) == pytest.approx(1, abs=0.02)
 
 
 def turn_of(focal: float, width: int, height: int, degrees: float = 24) -> list[PairMatches]:
@@ -46,8 +51,17 @@ def turn_of(focal: float, width: int, height: int, degrees: float = 24) -> list[
 def test_a_long_lens_is_plausible_however_the_camera_is_held(width: int, height: int) -> None:
     focal = 500.0  # 35 degrees across the longer side, 20 across the other
     panorama = fit_panorama(turn_of(focal, width, height), 8, width, height)
-    assert panorama is not None and panorama.focal_known and not panorama.slides
+    assert panorama is not None and panorama.focal_known and not panorama.long_lens
     assert panorama.focal == pytest.approx(focal, rel=0.01)
+
+
+def test_a_small_turn_of_a_telephoto_lens_is_one_of_a_long_lens() -> None:
+    """Of 18 degrees: the turn is too small to tell it from longer ones."""
+    matches = turn_of(1000.0, 320, 180, 2)
+    panorama = fit_panorama(matches, 8, 320, 180)
+    assert panorama is not None and panorama.long_lens and panorama.explained > 0.99
+    share = rotation_share(matches, panorama, 320, 180)
+    assert share is not None and share > 0.99
 
 
 @pytest.mark.parametrize(("width", "height"), [(320, 180), (180, 320)])
@@ -56,6 +70,7 @@ def test_the_default_field_of_view_is_across_the_longer_side(width: int, height:
     assert focal == pytest.approx(160 / np.tan(np.radians(30)))
     panorama = fit_panorama(turn_of(200.0, width, height, 0.3), 8, width, height)
     assert panorama is not None and not panorama.focal_known and panorama.focal == focal
+    assert not panorama.long_lens
     assert field_of_view(focal, width, height) == pytest.approx(60)
 
 

@@ -289,7 +289,7 @@ def find_motion(
     if panorama is not None:
         share = rotation_share(matches, panorama, width, height, rotation)
     enough = share is not None and share >= tuning.min_rotation_share
-    if panorama is not None and enough and not panorama.slides:
+    if panorama is not None and enough:
         still = panorama.max_displacement < rotation.max_tripod_motion_px
         return ("tripod" if still else "rotation"), share
     shaken = shaken_poses(equalized, clipped, clipped, tuning)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -151,6 +152,31 @@ def nearest_mover(
             to_shape = cKDTree(shape).query(pixels[far])[0]
             owner[far[to_shape > MAX_TRACK_DISTANCE_PX]] = NO_MOVER
     return owner
+
+
+def movers_in_picture(
+    movers: Sequence[Mover], t: int, moving: np.ndarray, camera: PinholeCamera, tracked: bool = True
+) -> np.ndarray:
+    """The mover (H, W) of every pixel that is `moving` (H, W) bool in the picture of
+    `camera` at the t-th time; `NO_MOVER` elsewhere.
+
+    As `nearest_mover` has it, but what is connected to a rigid mover is a part of it,
+    such as the rod that a ball hangs from.
+    """
+    result = np.full(moving.shape, NO_MOVER)
+    rows, columns = np.nonzero(moving)
+    pixels = np.stack([columns, rows], -1) + 0.5
+    owner = nearest_mover(movers, t, pixels, camera, tracked)
+    rigid = np.array([*(mover.rigid for mover in movers), False])[owner]
+    _, regions = cv2.connectedComponents(moving.astype(np.uint8), connectivity=8)
+    region = regions[rows, columns]
+    for k in np.unique(region[owner == NO_MOVER]):
+        lost = np.nonzero((region == k) & (owner == NO_MOVER))[0]
+        own = np.nonzero((region == k) & rigid)[0]
+        if len(own):
+            owner[lost] = owner[own[cKDTree(pixels[own]).query(pixels[lost])[1]]]
+    result[rows, columns] = owner
+    return result
 
 
 def tracks_in_picture(mover: Mover, t: int) -> np.ndarray:

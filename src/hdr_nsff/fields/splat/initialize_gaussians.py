@@ -40,7 +40,7 @@ from hdr_nsff.fields.splat.initialize_local import (
     tracks_are_of,
 )
 from hdr_nsff.fields.splat.splat import Splat
-from hdr_nsff.scene.movers import Mover, fill_mover_depth, nearest_mover
+from hdr_nsff.scene.movers import Mover, fill_mover_depth, movers_in_picture
 from hdr_nsff.scene.scene import Frame, Scene, surely_moving
 
 # a cell is this many times longer along the view than across, as shares of the frustum
@@ -265,8 +265,8 @@ def mover_points(
         f = with_mover_depth(f, t, movers)
     moving = surely_moving(f) & ~local_mask(scene, i)
     points = unproject_frame(f, i, moving.reshape(-1), scene.near, scene.far, to_radiance)
-    y, x = np.nonzero(moving.numpy())
-    owner = nearest_mover(movers, t, np.stack([x, y], -1) + 0.5, camera_arrays(f), tracked)
+    marked = np.zeros(moving.shape, bool) if f.moving is None else f.moving.numpy()
+    owner = movers_in_picture(movers, t, marked, camera_arrays(f), tracked)[moving.numpy()]
     canonical = points.positions.double().numpy().copy()
     for k, mover in enumerate(movers):
         canonical[owner == k] = mover.canonical(canonical[owner == k], t)

@@ -30,7 +30,7 @@ from hdr_nsff.fields.point_cloud import (
 )
 from hdr_nsff.fields.splat.gaussians import from_log_radiance
 from hdr_nsff.fields.splat.local_gaussians import MAX_AGE, LocalGaussians, frame_step
-from hdr_nsff.scene.movers import PinholeCamera, nearest_mover
+from hdr_nsff.scene.movers import PinholeCamera, movers_in_picture
 from hdr_nsff.scene.scene import Frame, Scene, surely_moving
 
 OVERLAP = 0.5  # standard deviation relative to the side of a cell (hand-chosen on real clips)
@@ -78,16 +78,12 @@ def local_mask(scene: Scene, i: int) -> Tensor:
     f = scene.train[i]
     moving = surely_moving(f)
     rigid = np.array([*(mover.rigid for mover in scene.movers), False])
-    if not any(rigid):
+    if f.moving is None or not any(rigid):
         return moving
-    y, x = np.nonzero(moving.numpy())
-    pixels = np.stack([x, y], -1) + 0.5
-    owner = nearest_mover(
-        scene.movers, time_of(scene, i), pixels, camera_arrays(f), tracks_are_of(scene, i)
+    owner = movers_in_picture(
+        scene.movers, time_of(scene, i), f.moving.numpy(), camera_arrays(f), tracks_are_of(scene, i)
     )
-    result = torch.zeros_like(moving)
-    result[y, x] = torch.from_numpy(~rigid[owner])
-    return result
+    return moving & torch.from_numpy(~rigid[owner])
 
 
 def time_of(scene: Scene, i: int) -> int:

@@ -12,7 +12,7 @@ from hdr_nsff.core.io import read_npy
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.scene.manifest import FrameEntry
-from hdr_nsff.scene.movers import Mover, nearest_mover, read_movers
+from hdr_nsff.scene.movers import Mover, movers_in_picture, read_movers
 
 NUM_COLUMNS = 6  # frames shown
 STRIPE_PX = 3  # width of the stripes on movers that are not rigid
@@ -67,8 +67,9 @@ def mover_cell(work: Work, f: FrameEntry, movers: Sequence[Mover]) -> np.ndarray
     if f.index not in times:
         return gray
     t = times.index(f.index)
-    y, x = np.nonzero(read_mask(work.folder / str(f.mask)))
-    owner = nearest_mover(movers, t, np.stack([x, y], -1) + 0.5, work.camera(f))
+    moving = read_mask(work.folder / str(f.mask))
+    y, x = np.nonzero(moving)
+    owner = movers_in_picture(movers, t, moving, work.camera(f))[y, x]
     colors = np.concatenate([mover_colors(movers), NO_MOVER_COLOR])
     rigid = np.array([*(mover.rigid for mover in movers), False])  # the last is `NO_MOVER`
     colored = rigid[owner] | ((x + y) // STRIPE_PX % 2 == 0)

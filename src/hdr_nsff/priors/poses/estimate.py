@@ -51,6 +51,7 @@ from hdr_nsff.priors.poses.reconstruct import (
 )
 from hdr_nsff.priors.poses.rotation import (
     Panorama,
+    RotationTuning,
     default_focal,
     fit_panorama,
     fit_video,
@@ -276,7 +277,6 @@ def parallax_free_share(
     """The share of static matches that pure rotations explain, in [0, 1], from frames
     spread over the clip (T, H, W, 3); `ignore` (T, H, W) bool.
 
-    Footage that slides past something flat gets at most `min_rotation_share_fallback`.
     None where too little matches.
     """
     matching, rotation = tuning.reconstruction.matching, tuning.reconstruction.rotation
@@ -288,10 +288,7 @@ def parallax_free_share(
     panorama = fit_panorama(matches, len(sampled), width, height, rotation)
     if panorama is None:
         return None
-    share = rotation_share(matches, panorama, width, height, rotation)
-    if share is not None and panorama.slides:
-        return min(share, tuning.min_rotation_share_fallback)
-    return share
+    return rotation_share(matches, panorama, width, height, rotation)
 
 
 def still_poses(
@@ -359,7 +356,7 @@ def still_panorama(
         linked=np.ones(count, bool),
         focal=default_focal(longer_side, tuning.reconstruction.rotation),
         focal_known=False,
-        slides=False,
+        long_lens=False,
         explained=1.0,
         frame_errors=np.full(count, error_px),
         max_displacement=0.0,
@@ -406,7 +403,7 @@ def panorama_poses(
         registered=panorama.linked | still,
         parallax="none" if still else "rotation",
         frame_errors=panorama.frame_errors,
-        notes=rotation_notes(panorama, still, rotation.default_fov_degrees),
+        notes=rotation_notes(panorama, still, rotation),
     )
     if lens == "auto":
         note = "lens distortion is not estimated without parallax; --lens-distortion gives it"
@@ -416,7 +413,7 @@ def panorama_poses(
     return interpolate(poses, [list(range(count))])
 
 
-def rotation_notes(panorama: Panorama, still: bool, default_fov: float) -> tuple[str, str]:
+def rotation_notes(panorama: Panorama, still: bool, tuning: RotationTuning) -> tuple[str, str]:
     """What was found of a camera without parallax, in sentences."""
     motion = "no parallax: the camera stands still"
     if not still:  # a camera that slides slowly past what is far away looks the same
@@ -424,7 +421,10 @@ def rotation_notes(panorama: Panorama, still: bool, default_fov: float) -> tuple
         motion = f"hardly any parallax: the camera counts as one that turns in place ({by})"
     origin = "from the turn"
     if not panorama.focal_known:
-        origin = f"assumed: {default_fov:.0f} degrees across the longer side"
+        lens, fov = "", tuning.default_fov_degrees
+        if panorama.long_lens:
+            lens, fov = "a long lens, ", tuning.long_fov_degrees
+        origin = f"assumed: {lens}{fov:.0f} degrees across the longer side"
     return (
         f"{motion}; HDR video and in-between times work, novel viewpoints do not",
         f"focal length {panorama.focal:.0f} px, {origin}",

@@ -56,9 +56,11 @@ class RotationTuning:
     max_log_focal_deviation: float = 0.05
     min_fov_degrees: float = 25.0
     max_fov_degrees: float = 120.0
-    # the camera slides past something flat when a long lens explains the matches better
-    # by this factor
-    min_slide_cost_ratio: float = 1.5
+    # a lens is long where one of this field of view explains the matches better than
+    # the default by this factor (a painted slide past a wall: 100; a pan of 20 degrees,
+    # cut from the middle of a wider one: 4; clips with parallax: up to 1.1)
+    long_fov_degrees: float = 10.0
+    min_long_cost_ratio: float = 1.5
     explained_error_px: float = 2.0  # of matches that count as explained by the rotations
     min_explained: float = 0.8  # share of the matches, for footage that is only rotations
     max_tripod_motion_px: float = 0.75  # farthest displacement of a camera that stands still
@@ -79,10 +81,10 @@ class Panorama:
     rotations: np.ndarray  # (T, 3, 3) camera to world; the middle frame looks along +z
     linked: np.ndarray  # (T,) bool: enough matches link this frame to the others
     focal: float  # pixels
-    focal_known: bool  # else it is that of the default field of view
-    # a sideways slide past something flat explains the matches much better than any
-    # turn
-    slides: bool
+    focal_known: bool  # else it is that of the default field of view, or of a long lens
+    # behind a long lens, a camera that turns sees what one that slides past something
+    # flat does
+    long_lens: bool
     explained: float  # share of the matches that these rotations explain
     frame_errors: np.ndarray  # (T,) median residual in pixels, NaN where not linked
     # pixels: the farthest that the image center or a corner moves away from its
@@ -94,7 +96,14 @@ def default_focal(longer_side: int, tuning: RotationTuning = RotationTuning()) -
     """The focal length in pixels of a camera with the default field of view across the
     `longer_side` of the image, in pixels.
     """
-    return longer_side / 2 / float(np.tan(np.radians(tuning.default_fov_degrees) / 2))
+    return focal_length(tuning.default_fov_degrees, longer_side)
+
+
+def focal_length(fov_degrees: float, longer_side: int) -> float:
+    """The focal length in pixels of a field of view across the `longer_side` of an
+    image, in pixels.
+    """
+    return longer_side / 2 / float(np.tan(np.radians(fov_degrees) / 2))
 
 
 def field_of_view(focal: float, width: int, height: int) -> float:
@@ -217,13 +226,13 @@ def fit_panorama(
     fov = field_of_view(free.focal, width, height)
     plausible = tuning.min_fov_degrees < fov < tuning.max_fov_degrees
     focal_known = plausible and free.log_focal_deviation < tuning.max_log_focal_deviation
-    # through an endlessly long lens a turn is a shift of the image
-    slides = False
-    if fov <= tuning.min_fov_degrees:
-        held_cost = robust_cost(held.rotations, guess, pairs)
-        free_cost = robust_cost(free.rotations, free.focal, pairs)
-        slides = held_cost > tuning.min_slide_cost_ratio * free_cost
-    best = free if focal_known else held
+    best, long_lens = free if focal_known else held, False
+    if not focal_known:
+        focal = focal_length(tuning.long_fov_degrees, max(width, height))
+        long = refine(free.rotations, focal, pairs, False)
+        cost, long_cost = (robust_cost(f.rotations, f.focal, pairs) for f in (held, long))
+        if cost > tuning.min_long_cost_ratio * long_cost:
+            best, long_lens = long, True
     predicted, _ = rotate_pixels(best.rotations, best.focal, pairs.frames, pairs.p)
     residual = np.linalg.norm(predicted - pairs.q, axis=1)
     frame_errors = np.full(count, np.nan)
@@ -235,7 +244,7 @@ def fit_panorama(
         linked=linked,
         focal=best.focal,
         focal_known=focal_known,
-        slides=slides,
+        long_lens=long_lens,
         explained=float((residual < tuning.explained_error_px).mean()),
         frame_errors=frame_errors,
         max_displacement=max_displacement(rotations[linked], best.focal, width, height),
