@@ -12,7 +12,7 @@ from toy_scene import CARD, card_offset
 from hdr_nsff.fields.build import build_field
 from hdr_nsff.fields.point_cloud import PointCloud
 from hdr_nsff.fields.splat.config import SplatConfig
-from hdr_nsff.fields.splat.initialize_gaussians import initialize_gaussians
+from hdr_nsff.fields.splat.initialize_gaussians import initialize_gaussians, mover_points
 from hdr_nsff.fields.splat.initialize_local import (
     MAX_APPROACH,
     bound_approach,
@@ -111,6 +111,15 @@ def test_two_movers_share_the_mask_by_their_tracks(soft: Scene) -> None:
     east = replace(mover, pixels=mover.pixels + np.array([1000.0, 0.0]))
     near = replace(mover, rigid=True)
     assert not local_mask(replace(soft, movers=(east, near)), 2).any()
+
+
+def test_points_of_rigid_movers_are_counted_among_these(soft: Scene) -> None:
+    (mover,) = soft.movers
+    east = replace(mover, pixels=mover.pixels + np.array([1000.0, 0.0]))
+    near = replace(mover, rigid=True)
+    scene = replace(soft, movers=(east, near))
+    points, owner = mover_points(scene, 2, 2, [near], recorded)
+    assert len(points.positions) == len(owner) > 40 and (owner == 0).all()
 
 
 def test_what_moves_beyond_a_rigid_mover_is_local(soft: Scene) -> None:

@@ -112,18 +112,19 @@ def test_what_moves_while_no_track_is_seen_is_a_mover_where_its_shape_is() -> No
     assert nearest_mover([gone], 1, pixels, CAMERA).tolist() == [NO_MOVER] * 2
 
 
-def test_what_is_connected_to_a_rigid_mover_is_a_part_of_it() -> None:
+@pytest.mark.parametrize("in_turn", [True, False])
+def test_what_is_connected_to_a_rigid_mover_is_a_part_of_it_before_a_rig(in_turn: bool) -> None:
     ball = mover([[4.0, 2.0]], [[0, 0, 1]])
     other = mover([[50.0, 2.0]], [[4.6, 0, 1]])
     moving = np.zeros((4, 64), bool)
     moving[2, 3:30] = True  # the ball, and a rod of 26 pixels
     moving[0, 34:38] = True  # a shadow between both
-    found = movers_in_picture([ball, other], 1, moving, CAMERA)
+    found = movers_in_picture([ball, other], 1, moving, CAMERA, True, in_turn)
     expected = np.full((4, 64), NO_MOVER)
-    expected[2, 3:30] = 0
+    expected[2, 3 : 30 if in_turn else 12] = 0  # 8 pixels of reach
     assert (found == expected).all()
     soft = replace(ball, rigid=False)
-    assert (movers_in_picture([soft], 1, moving, CAMERA)[moving] == 0).all()
+    assert (movers_in_picture([soft], 1, moving, CAMERA, True, in_turn)[moving] == 0).all()
 
 
 def test_a_mover_without_a_shape_gives_no_depth() -> None:

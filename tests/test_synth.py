@@ -20,6 +20,7 @@ from hdr_nsff.geometry import pinhole
 from hdr_nsff.geometry.lens import Lens
 from hdr_nsff.geometry.pinhole import pixel_centers, project
 from hdr_nsff.maths.hdr_signal import display_light, encode, ycbcr_planes
+from hdr_nsff.scene.manifest import Manifest
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.scene.truth import Truth, true_pictures
 from hdr_nsff.synth import synth as verb
@@ -59,6 +60,7 @@ def test_truth_and_video_hold_what_was_rendered(flat: SynthConfig) -> None:
 @pytest.mark.parametrize("views", ["mono", "rig"])
 def test_an_oracle_is_a_scene_that_is_marked_as_one(flat: SynthConfig, views: Views) -> None:
     synth(replace(flat, views=views))
+    assert Manifest.load(flat.out / "oracle").rig == (9 if views == "rig" else 1)
     scene = Scene.open(flat.out / "oracle")
     assert {s.note for s in scene.manifest.steps.values()} == {"oracle: from truth"}
     assert [f.bracket for f in scene.train] == [0, 1, 2] * 4

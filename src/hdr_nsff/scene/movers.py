@@ -155,28 +155,43 @@ def nearest_mover(
 
 
 def movers_in_picture(
-    movers: Sequence[Mover], t: int, moving: np.ndarray, camera: PinholeCamera, tracked: bool = True
+    movers: Sequence[Mover],
+    t: int,
+    moving: np.ndarray,
+    camera: PinholeCamera,
+    tracked: bool,
+    in_turn: bool,
 ) -> np.ndarray:
     """The mover (H, W) of every pixel that is `moving` (H, W) bool in the picture of
     `camera` at the t-th time; `NO_MOVER` elsewhere.
 
-    As `nearest_mover` has it, but what is connected to a rigid mover is a part of it,
-    such as the rod that a ball hangs from.
+    As `nearest_mover` has it. But before cameras that take turns, `in_turn`, what is
+    connected to a rigid mover is a part of it, such as the rod that a ball hangs from:
+    no other camera sees that moment, so by itself it would have no depth.
     """
     result = np.full(moving.shape, NO_MOVER)
     rows, columns = np.nonzero(moving)
     pixels = np.stack([columns, rows], -1) + 0.5
     owner = nearest_mover(movers, t, pixels, camera, tracked)
-    rigid = np.array([*(mover.rigid for mover in movers), False])[owner]
-    _, regions = cv2.connectedComponents(moving.astype(np.uint8), connectivity=8)
-    region = regions[rows, columns]
-    for k in np.unique(region[owner == NO_MOVER]):
-        lost = np.nonzero((region == k) & (owner == NO_MOVER))[0]
-        own = np.nonzero((region == k) & rigid)[0]
-        if len(own):
-            owner[lost] = owner[own[cKDTree(pixels[own]).query(pixels[lost])[1]]]
+    if in_turn:
+        _, regions = cv2.connectedComponents(moving.astype(np.uint8), connectivity=8)
+        join_regions(owner, pixels, regions[rows, columns], [mover.rigid for mover in movers])
     result[rows, columns] = owner
     return result
+
+
+def join_regions(
+    owner: np.ndarray, pixels: np.ndarray, region: np.ndarray, rigid: Sequence[bool]
+) -> None:
+    """Give pixels (P, 2) of no mover to the rigid one that is nearest in their `region`
+    (P,), if there is one; changes `owner` (P,). `rigid`: which movers are.
+    """
+    of_rigid = np.array([*rigid, False])[owner]
+    for k in np.unique(region[owner == NO_MOVER]):
+        lost = np.nonzero((region == k) & (owner == NO_MOVER))[0]
+        own = np.nonzero((region == k) & of_rigid)[0]
+        if len(own):
+            owner[lost] = owner[own[cKDTree(pixels[own]).query(pixels[lost])[1]]]
 
 
 def tracks_in_picture(mover: Mover, t: int) -> np.ndarray:

@@ -60,9 +60,11 @@ def write_oracle(
     ev: list[float],
     reference: int,
     noise: OracleNoise,
+    rig: int = 1,
 ) -> None:
     """Write `out`/oracle from the rendered channels of every frame (`exact`), the
-    recorded `video` (T, H, W, 3), poses (3, 4) and the exposures of the brackets.
+    recorded `video` (T, H, W, 3), poses (3, 4) and the exposures of the brackets;
+    `rig`: how many cameras take the frames in turn.
     """
     folder = out / "oracle"
     rng = np.random.default_rng(noise.seed)
@@ -93,6 +95,7 @@ def write_oracle(
         width=width,
         height=height,
         cycle=len(ev),
+        rig=rig,
         reference_bracket=reference,
         bracket_ev=list(ev),
         exposure_given=True,

@@ -112,7 +112,10 @@ def synth(config: SynthConfig) -> None:
             )
             frames = [exact(config.out, view) for view in clip]
             poses = [view.c2w for view in clip]
-            write_oracle(config.out, scene, frames, video, K, poses, relative, reference, noise)
+            rig = len(scene.rig) if config.views == "rig" else 1
+            write_oracle(
+                config.out, scene, frames, video, K, poses, relative, reference, noise, rig
+            )
         else:
             remove_stale(config.out)
     say(

@@ -33,14 +33,14 @@ from hdr_nsff.fields.splat.detail import cell_sizes, detail_density, scale_by_si
 from hdr_nsff.fields.splat.free_space import remove_fog
 from hdr_nsff.fields.splat.gaussians import START_LOGIT, Gaussians, from_log_radiance
 from hdr_nsff.fields.splat.initialize_local import (
-    camera_arrays,
     limit_rigid_movers,
     local_mask,
+    mover_map,
     place_local,
     tracks_are_of,
 )
 from hdr_nsff.fields.splat.splat import Splat
-from hdr_nsff.scene.movers import Mover, fill_mover_depth, movers_in_picture
+from hdr_nsff.scene.movers import Mover, fill_mover_depth
 from hdr_nsff.scene.scene import Frame, Scene, surely_moving
 
 # a cell is this many times longer along the view than across, as shares of the frustum
@@ -260,13 +260,12 @@ def mover_points(
     """The pixels of rigid `movers` in training frame `i`, at the t-th time of these, as
     points at their canonical places, and the mover of each (P,).
     """
-    f, tracked = scene.train[i], tracks_are_of(scene, i)
-    if tracked:
+    f = scene.train[i]
+    if tracks_are_of(scene, i):
         f = with_mover_depth(f, t, movers)
     moving = surely_moving(f) & ~local_mask(scene, i)
     points = unproject_frame(f, i, moving.reshape(-1), scene.near, scene.far, to_radiance)
-    marked = np.zeros(moving.shape, bool) if f.moving is None else f.moving.numpy()
-    owner = movers_in_picture(movers, t, marked, camera_arrays(f), tracked)[moving.numpy()]
+    owner = mover_map(scene, i, t, movers)[moving.numpy()]
     canonical = points.positions.double().numpy().copy()
     for k, mover in enumerate(movers):
         canonical[owner == k] = mover.canonical(canonical[owner == k], t)

@@ -30,7 +30,7 @@ from hdr_nsff.fields.point_cloud import (
 )
 from hdr_nsff.fields.splat.gaussians import from_log_radiance
 from hdr_nsff.fields.splat.local_gaussians import MAX_AGE, LocalGaussians, frame_step
-from hdr_nsff.scene.movers import PinholeCamera, movers_in_picture
+from hdr_nsff.scene.movers import Mover, PinholeCamera, movers_in_picture
 from hdr_nsff.scene.scene import Frame, Scene, surely_moving
 
 OVERLAP = 0.5  # standard deviation relative to the side of a cell (hand-chosen on real clips)
@@ -75,15 +75,23 @@ def local_mask(scene: Scene, i: int) -> Tensor:
     """(H, W) bool: pixels of training frame `i` that surely move, but with no rigid
     mover.
     """
-    f = scene.train[i]
-    moving = surely_moving(f)
+    moving = surely_moving(scene.train[i])
     rigid = np.array([*(mover.rigid for mover in scene.movers), False])
-    if f.moving is None or not any(rigid):
+    if not any(rigid):
         return moving
-    owner = movers_in_picture(
-        scene.movers, time_of(scene, i), f.moving.numpy(), camera_arrays(f), tracks_are_of(scene, i)
-    )
+    owner = mover_map(scene, i, time_of(scene, i), scene.movers)
     return moving & torch.from_numpy(~rigid[owner])
+
+
+def mover_map(scene: Scene, i: int, t: int, movers: Sequence[Mover]) -> np.ndarray:
+    """Which of `movers` (H, W) each moving pixel of training frame `i` shows, at their
+    t-th time; `NO_MOVER` elsewhere.
+    """
+    f = scene.train[i]
+    moving = np.zeros(f.image.shape[:2], bool) if f.moving is None else f.moving.numpy()
+    in_turn = scene.manifest.rig > 1
+    tracked = tracks_are_of(scene, i)
+    return movers_in_picture(movers, t, moving, camera_arrays(f), tracked, in_turn)
 
 
 def time_of(scene: Scene, i: int) -> int:

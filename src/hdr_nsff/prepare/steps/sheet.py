@@ -69,7 +69,9 @@ def mover_cell(work: Work, f: FrameEntry, movers: Sequence[Mover]) -> np.ndarray
     t = times.index(f.index)
     moving = read_mask(work.folder / str(f.mask))
     y, x = np.nonzero(moving)
-    owner = movers_in_picture(movers, t, moving, work.camera(f))[y, x]
+    owner = movers_in_picture(
+        movers, t, moving, work.camera(f), tracked=True, in_turn=work.manifest.rig > 1
+    )[y, x]
     colors = np.concatenate([mover_colors(movers), NO_MOVER_COLOR])
     rigid = np.array([*(mover.rigid for mover in movers), False])  # the last is `NO_MOVER`
     colored = rigid[owner] | ((x + y) // STRIPE_PX % 2 == 0)
