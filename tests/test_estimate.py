@@ -87,6 +87,13 @@ def test_parallax_is_distinguished_from_a_turn():
     assert parallax_free_share(sliding(PLACES), nothing) < PosesTuning().min_rotation_share
 
 
+def test_a_short_slide_past_boards_is_no_turn_behind_a_long_lens() -> None:
+    """The wall, most of the picture, shifts as a whole; the boards do not."""
+    clip, tuning = sliding(PLACES[:5]), PosesTuning()
+    share = parallax_free_share(clip, np.zeros(clip.shape[:3], bool))
+    assert share == tuning.min_rotation_share_fallback < tuning.min_rotation_share
+
+
 def test_frames_without_texture_fail_in_a_sentence(tmp_path):
     pytest.importorskip("pycolmap")
     with pytest.raises(InputError, match=r"no two frames could be matched.*--poses"):

@@ -25,7 +25,7 @@ from hdr_nsff.footage.footage import Footage, open_footage
 from hdr_nsff.footage.frame_choice import check_frame_size
 from hdr_nsff.footage.ingest import MAX_FRAMES, read_frames
 from hdr_nsff.footage.timestamps import frame_gaps
-from hdr_nsff.priors.poses.estimate import PosesTuning, shaken_poses
+from hdr_nsff.priors.poses.estimate import PosesTuning, believed_share, shaken_poses
 from hdr_nsff.priors.poses.matching import (
     Keypoints,
     PairMatches,
@@ -285,10 +285,11 @@ def find_motion(
     matches = match_pairs([keypoints[t] for t in chosen], pairs, matching)
     height, width = equalized.shape[1:3]
     panorama = fit_panorama(matches, len(chosen), width, height, rotation)
-    share = None
+    share = believed = None
     if panorama is not None:
         share = rotation_share(matches, panorama, width, height, rotation)
-    enough = share is not None and share >= tuning.min_rotation_share
+        believed = believed_share(panorama, share, tuning)
+    enough = believed is not None and believed >= tuning.min_rotation_share
     if panorama is not None and enough:
         still = panorama.max_displacement < rotation.max_tripod_motion_px
         return ("tripod" if still else "rotation"), share

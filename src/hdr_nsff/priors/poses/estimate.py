@@ -82,6 +82,10 @@ class PosesTuning:
     # the same where structure from motion fails, or its masks keep changing
     # (hand-chosen)
     min_rotation_share_fallback: float = 0.5
+    # the same behind a long lens, where a camera that slides past something flat sees a
+    # turn, too (a painted wall behind boards: 0.80, a pan of 20 degrees: 0.97); with
+    # less, structure from motion is tried first
+    min_long_lens_share: float = 0.9
     # share from which too little parallax is left to look for a lens (a painted clip
     # with a share of 0.68 shows its lens)
     no_lens_share: float = 0.7
@@ -288,7 +292,19 @@ def parallax_free_share(
     panorama = fit_panorama(matches, len(sampled), width, height, rotation)
     if panorama is None:
         return None
-    return rotation_share(matches, panorama, width, height, rotation)
+    share = rotation_share(matches, panorama, width, height, rotation)
+    return believed_share(panorama, share, tuning)
+
+
+def believed_share(
+    panorama: Panorama, share: float | None, tuning: PosesTuning = PosesTuning()
+) -> float | None:
+    """A `share` of matches that the rotations of a `panorama` explain, at most
+    `min_rotation_share_fallback` where these may be of a camera that slides.
+    """
+    if share is None or not panorama.long_lens or share >= tuning.min_long_lens_share:
+        return share
+    return min(share, tuning.min_rotation_share_fallback)
 
 
 def still_poses(
