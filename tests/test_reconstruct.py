@@ -89,7 +89,7 @@ def test_failure_names_the_lens_or_the_frames():
         k: ColmapImage(f"{k:05d}.png", 1, np.eye(4)[:3], np.zeros((0, 2)), np.zeros(0))
         for k in (0, 1, 2, 6)
     }
-    long_lens, short_lens = (replace(model(f, 0), images=images) for f in (500, 90))
+    long_lens, short_lens = (replace(model(f, 0), images=images) for f in (1500, 90))
     message = failure_message(short_lens, views_of(5), [])
     assert "focal length of 45 px is impossible" in message  # doubled frames: 90 / 2
     message = failure_message(long_lens, views_of(10), [])
@@ -99,7 +99,7 @@ def test_failure_names_the_lens_or_the_frames():
     assert "--tripod" in failure_message(None, views_of(10), [])
 
 
-@pytest.mark.parametrize(("limit", "tried"), [(1, 1), (3, 3), (8, 4)])
+@pytest.mark.parametrize(("limit", "tried"), [(1, 1), (3, 3), (8, 6)])
 def test_no_more_mappings_than_allowed_are_tried(tmp_path, monkeypatch, limit, tried):
     jobs = []
 

@@ -12,13 +12,18 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 from posed_clips import PLACES, sliding
+from scipy.spatial.transform import Rotation
 
 from hdr_nsff import cli
 from hdr_nsff.core.images import write_png
 from hdr_nsff.core.io import FULL
+from hdr_nsff.footage.colmap import read_model
 from hdr_nsff.priors.poses import sfm
 from hdr_nsff.priors.poses.colmap_matches import MIN_PAIRS_OF_PROCESS
+from hdr_nsff.priors.poses.reconstruct import attempts
+from hdr_nsff.priors.poses.rotation import focal_length
 from hdr_nsff.priors.poses.trimming import TrimmingTuning
+from hdr_nsff.priors.poses.view_matches import EarlierRounds
 
 
 def test_a_worker_that_crashes_reports_why(tmp_path):
@@ -118,3 +123,36 @@ def test_a_job_reaches_the_worker_unchanged(tmp_path):
     job = sfm.Job(str(tmp_path), [["a.png"]], [], 100.0, "global", tuning=tuning)
     (tmp_path / "job.json").write_text(json.dumps(asdict(job)))
     assert sfm.read_job(tmp_path / "job.json") == job
+
+
+def test_a_long_lens_is_found_from_the_guess_of_one(tmp_path):
+    pytest.importorskip("pycolmap")
+    size, count, focal = 320, 12, focal_length(11, 320)
+    rng = np.random.default_rng(0)
+    points = rng.uniform((-2, -2, 8), (2, 2, 16), (400, 3))
+    angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    eyes = np.stack([1.5 * np.sin(angle), 0.5 * np.sin(2 * angle), np.cos(angle)], 1)
+    names = [f"{v:02d}.png" for v in range(count)]
+    keypoints, seen = [], []
+    for name, eye in zip(names, eyes, strict=True):
+        turn = Rotation.from_euler("yx", (-eye[0] / 12, eye[1] / 12)).inv()  # looks at (0, 0, 12)
+        x, y, z = turn.apply(points - eye).T
+        noise = rng.normal(0, 0.3, (400, 2))
+        pixels = focal * np.stack([x / z, y / z], 1) + size / 2 + noise
+        rows = np.flatnonzero(((pixels > 0) & (pixels < size)).all(1))
+        keypoints.append(pixels[rows])
+        seen.append(rows)
+        write_png(tmp_path / "images" / name, np.zeros((size, size, 3)))
+    pairs = [(a, b) for a in range(count) for b in range(a + 1, count)]
+    matches = [
+        np.stack(np.intersect1d(seen[a], seen[b], return_indices=True)[1:], 1) for a, b in pairs
+    ]
+    named = [(names[a], names[b]) for a, b in pairs]
+    sfm.write_matches(tmp_path, names, keypoints, named, matches)
+    job = sfm.Job(str(tmp_path), [names], named, focal_length(60, size), "match")
+    usual, long, _ = attempts(job, EarlierRounds(), focal_length(24, size))
+    found = [[read_model(folder) for folder in sfm.run(attempt)] for attempt in (usual, long)]
+    assert len(found[0][0].images) < count  # few at an absurd focal length come first
+    (model,) = found[1]
+    assert len(model.images) == count
+    assert model.cameras[1].K[0, 0] == pytest.approx(focal, rel=0.03)

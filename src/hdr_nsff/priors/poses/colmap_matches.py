@@ -50,13 +50,19 @@ def import_images(job: Job, database: Path) -> dict[str, int]:
         pycolmap.import_images(
             database, Path(job.folder) / "images", pycolmap.CameraMode.SINGLE, group, reading
         )
+    set_cameras(job, database)
     with pycolmap.Database.open(database) as db:
+        return {image.name: image.image_id for image in db.read_all_images()}
+
+
+def set_cameras(job: Job, database: Path) -> None:
+    """Give the cameras of a database the first guess of their lens."""
+    with load_pycolmap().Database.open(database) as db:
         for camera in db.read_all_cameras():
             camera.focal_length = job.focal
             if job.distortion:
                 set_lens(camera, job.distortion)
             db.update_camera(camera)
-        return {image.name: image.image_id for image in db.read_all_images()}
 
 
 def set_lens(camera: Any, distortion: list[float]) -> None:

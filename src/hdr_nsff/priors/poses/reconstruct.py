@@ -39,6 +39,7 @@ from hdr_nsff.priors.poses.rotation import (
     default_focal,
     field_of_view,
     fit_video,
+    focal_length,
 )
 from hdr_nsff.priors.poses.view_matches import (
     EarlierRounds,
@@ -58,11 +59,14 @@ class ReconstructionTuning:
     """
 
     # across the longer side: what undistorted video cameras plausibly see
-    min_fov_degrees: float = 25.0
+    min_fov_degrees: float = 10.0
     max_fov_degrees: float = 100.0
     # of a lens that was found to bend strongly, as wide ones do (a GoPro's: 104)
     max_fov_degrees_bent: float = 120.0
     strong_bend: float = 0.02  # of the longer side, at the corners (that clip: 0.1)
+    # the other first guess of a focal length: from the usual one, 60 degrees, mapping
+    # does not find a lens of 20 (from 30 it does)
+    long_lens_fov_degrees: float = 24.0
     enough_registered: float = 0.9  # share of the views that ends the search for a model
     max_attempts: int = 8  # mappings before the search ends
     min_registered: float = MIN_REGISTERED_SHARE  # share of the views below which poses have failed
@@ -179,6 +183,8 @@ def best_model(
     best: ColmapModel | None = None
     scale = upsampling_factor(views.images.shape[1:3], tuning.matching)
     failures, tries_left = [], tuning.max_attempts
+    longer_side = scale * max(views.images.shape[1:3])
+    long_focal = focal_length(tuning.long_lens_fov_degrees, longer_side)
     for leftover in workdir.glob(".sfm-*"):
         shutil.rmtree(leftover, ignore_errors=True)
     workdir.mkdir(parents=True, exist_ok=True)
@@ -198,7 +204,7 @@ def best_model(
             except sfm.SfmError as error:
                 failures.append(str(error))
                 continue
-            for attempt in attempts(job, earlier)[:tries_left]:
+            for attempt in attempts(job, earlier, long_focal)[:tries_left]:
                 tries_left -= 1
                 try:
                     folders = sfm.run(attempt)
@@ -224,9 +230,10 @@ def best_model(
     return best, scale
 
 
-def attempts(job: sfm.Job, earlier: EarlierRounds) -> list[sfm.Job]:
+def attempts(job: sfm.Job, earlier: EarlierRounds, long_focal: float) -> list[sfm.Job]:
     """The ways to map the views of a job, in the order in which they are tried: from
-    the poses of earlier rounds, from keyframes, all at once, and globally.
+    the poses of earlier rounds, from keyframes, all at once, from the focal length of a
+    long lens (pixels of the images), and globally.
     """
     tasks = []
     if earlier.model:
@@ -237,11 +244,10 @@ def attempts(job: sfm.Job, earlier: EarlierRounds) -> list[sfm.Job]:
         tasks.append(replace(job, task="adjust", start=str(start), keyframes=[]))
     if job.keyframes:
         tasks.append(replace(job, task="incremental"))
-    return [
-        *tasks,
-        replace(job, task="incremental", keyframes=[]),
-        replace(job, task="global", keyframes=[]),
-    ]
+    tasks.append(replace(job, task="incremental", keyframes=[]))
+    if not job.distortion:  # long lenses do not bend
+        tasks.append(replace(job, task="incremental", keyframes=[], focal=long_focal))
+    return [*tasks, replace(job, task="global", keyframes=[])]
 
 
 def write_job(

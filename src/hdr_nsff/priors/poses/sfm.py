@@ -83,7 +83,8 @@ class Job:
     @property
     def out(self) -> Path:
         """Where the models go."""
-        return Path(self.folder) / (f"{self.task}-keyframes" if self.keyframes else self.task)
+        name = f"{self.task}-{self.focal:.0f}"
+        return Path(self.folder) / (f"{name}-keyframes" if self.keyframes else name)
 
     tuning: SfmTuning = field(default_factory=SfmTuning)
 

@@ -27,6 +27,7 @@ from hdr_nsff.priors.poses.colmap_matches import (
     find_matches,
     image_names,
     import_images,
+    set_cameras,
     set_lens,
     verify,
 )
@@ -231,7 +232,9 @@ def main() -> None:
         find_matches(job, folder / "features.db", job.threads or usable_cores())
         return
     database = folder / "database.db"
-    if not database.exists():
+    if database.exists():
+        set_cameras(job, database)
+    else:
         load_matches(job, database)
     reconstruct(job, database)
 
