@@ -5,9 +5,11 @@ import posed_clips
 import pytest
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.footage.colmap import ColmapCamera, ColmapModel
 from hdr_nsff.geometry.lens import Lens, distorted_picture
 from hdr_nsff.priors.poses import sfm
 from hdr_nsff.priors.poses.estimate import Mapper, estimate_poses
+from hdr_nsff.priors.poses.lens import bent_cameras
 
 LENS = Lens(posed_clips.K, (0.15, 0.0, 0.0, 0.0), posed_clips.W, posed_clips.H)
 
@@ -62,3 +64,15 @@ def test_where_no_mapping_with_the_lens_succeeds_its_fit_counts(tmp_path, clip, 
     lens = estimate_poses(bent, None, tmp_path, threads=1, lens="auto").lenses[0]
     assert lens.max_displacement_px() == pytest.approx(LENS.max_displacement_px(), rel=0.3)
     assert (lens.width, lens.height) == (posed_clips.W, posed_clips.H)
+
+
+@pytest.mark.parametrize(("fov", "bends"), [(60, True), (30, True), (15, False)])
+def test_a_long_lens_does_not_bend(fov, bends):
+    focal = 320 / np.tan(np.radians(fov / 2))
+    camera = ColmapCamera("SIMPLE_PINHOLE", 640, 360, np.diag([focal, focal, 1]), np.zeros(0))
+    nothing = np.zeros(0)
+    model = ColmapModel({1: camera}, {}, nothing, np.zeros((0, 3)), nothing, nothing)
+    k1 = 0.03 * (focal / 320) ** 2  # ten pixels at the corners, whatever the focal length
+    fit = sfm.LensFit({1: (focal, k1, 0.0)}, model_error_px=0.5, error_px=0.4)
+    found = bent_cameras(fit, model, scale=1)
+    assert [mapping.distortion for mapping in found] == ([(k1, 0.0)] if bends else [])

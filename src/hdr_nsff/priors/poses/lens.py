@@ -15,6 +15,7 @@ from typing import Literal
 from hdr_nsff.footage.colmap import ColmapModel
 from hdr_nsff.geometry.lens import Lens
 from hdr_nsff.geometry.pinhole import intrinsics
+from hdr_nsff.priors.poses.rotation import field_of_view
 from hdr_nsff.priors.poses.sfm import LENS_FILE, Job, LensFit, parse_lens_fit
 from hdr_nsff.priors.poses.view_matches import EarlierRounds
 
@@ -32,6 +33,9 @@ class LensTuning:
     # rendered pinhole clip, 0.961 with 5 pixels of distortion at the corners
     # (hand-chosen between)
     max_error_share: float = 0.99
+    # a longer lens bends little, and behind it what bends and what is farther away look
+    # alike
+    min_fov_degrees: float = 25.0
 
 
 @dataclass(frozen=True)
@@ -79,7 +83,10 @@ def bent_cameras(
         K = intrinsics(focal, camera.width, camera.height)
         lens = Lens(K, (k1, k2, 0.0, 0.0), camera.width, camera.height)
         displacement = lens.max_displacement_px() / scale
-        if lens.is_one_to_one() and displacement >= tuning.min_displacement_px:
+        fov = field_of_view(camera.K[0, 0], camera.width, camera.height)
+        is_long = fov < tuning.min_fov_degrees
+        bends = lens.is_one_to_one() and displacement >= tuning.min_displacement_px
+        if bends and not is_long:
             found.append((displacement, Mapping((k1, k2), focal, refine=True, try_lens=True)))
     return [mapping for _, mapping in sorted(found, key=lambda item: -item[0])]
 

@@ -233,7 +233,7 @@ def best_model(
 def attempts(job: sfm.Job, earlier: EarlierRounds, long_focal: float) -> list[sfm.Job]:
     """The ways to map the views of a job, in the order in which they are tried: from
     the poses of earlier rounds, from keyframes, all at once, from the focal length of a
-    long lens (pixels of the images), and globally.
+    long lens (pixels of the images), with it held, and globally.
     """
     tasks = []
     if earlier.model:
@@ -246,7 +246,8 @@ def attempts(job: sfm.Job, earlier: EarlierRounds, long_focal: float) -> list[sf
         tasks.append(replace(job, task="incremental"))
     tasks.append(replace(job, task="incremental", keyframes=[]))
     if not job.distortion:  # long lenses do not bend
-        tasks.append(replace(job, task="incremental", keyframes=[], focal=long_focal))
+        long = replace(job, task="incremental", focal=long_focal)
+        tasks += [long, replace(long, refine_focal=False)]
     return [*tasks, replace(job, task="global", keyframes=[])]
 
 

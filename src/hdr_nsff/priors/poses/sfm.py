@@ -77,6 +77,7 @@ class Job:
     # k1, k2 of the images, to start from; empty: a pinhole camera
     distortion: list[float] = field(default_factory=list)
     refine_distortion: bool = True
+    refine_focal: bool = True  # while images are added; afterwards in any case
     # also fit another lens to every model, and write it to its folder (`LensFit`)
     try_lens: bool = False
 
@@ -84,7 +85,8 @@ class Job:
     def out(self) -> Path:
         """Where the models go."""
         name = f"{self.task}-{self.focal:.0f}"
-        return Path(self.folder) / (f"{name}-keyframes" if self.keyframes else name)
+        name += "-keyframes" if self.keyframes else ""
+        return Path(self.folder) / (name if self.refine_focal else f"{name}-held")
 
     tuning: SfmTuning = field(default_factory=SfmTuning)
 

@@ -129,6 +129,7 @@ def incremental_options(job: Job) -> Any:
     options.ba_global_max_refinements = tuning.max_global_refinements
     options.ba_global_function_tolerance = tuning.mapping_tolerance
     options.ba_local_function_tolerance = tuning.mapping_tolerance
+    options.ba_refine_focal_length = job.refine_focal
     options.ba_refine_extra_params = job.refine_distortion
     return options
 
