@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from toy_scene import EV, ToyScene
 
-from hdr_nsff.check import measure
+from hdr_nsff.check import lens, measure
 from hdr_nsff.check.check import CheckConfig, check
-from hdr_nsff.check.facts import CameraFacts, ClipFacts, ExposureFacts, FileFacts
+from hdr_nsff.check.facts import CameraFacts, ClipFacts, ExposureFacts, FileFacts, LensFacts
 from hdr_nsff.check.findings import judge, outlook
 from hdr_nsff.check.measure import measure_clip
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import read_image, write_png
 from hdr_nsff.footage.frame_files import CHECK_PICTURE, frame_files
+from hdr_nsff.geometry.poses import Poses
+from hdr_nsff.priors.poses.sfm import LENS_FILE, LensFit
+from hdr_nsff.priors.poses.view_matches import EarlierRounds
 
 WIDTH, HEIGHT, FRAMES = 240, 136, 12
 
@@ -76,6 +79,21 @@ def test_no_lens_is_looked_for_where_turns_alone_explain_most(
     facts, _, _ = measure_clip(clip_of(tmp_path, still_scene, [0.0] * 4))
     assert facts.camera.lens is None and facts.camera.rotation_share == share
     assert looked_for == ([share] if share < 0.7 else [])
+
+
+@pytest.mark.parametrize(("error_px", "straight"), [(0.5, True), (0.4, False)])
+def test_lines_are_straight_only_where_no_lens_explains_the_frames_better(
+    monkeypatch: pytest.MonkeyPatch, error_px: float, straight: bool
+) -> None:
+    def pinhole(*_: object, earlier: EarlierRounds, **__: object) -> Poses:
+        fit = LensFit({1: (100.0, 2.0, -1.4)}, model_error_px=0.5, error_px=error_px)
+        earlier.model[LENS_FILE] = json.dumps(asdict(fit)).encode()
+        c2w = np.tile(np.eye(4)[:3], (6, 1, 1))
+        return Poses(np.tile(np.eye(3), (6, 1, 1)), c2w, np.ones(6, bool), "full")
+
+    monkeypatch.setattr(lens, "estimate_poses", pinhole)
+    found = lens.measure_lens(np.zeros((6, 8, 8, 3)), np.zeros((6, 8, 8), bool), 1.0)
+    assert found == (LensFacts(0.0, 0.0, 0.0) if straight else None)
 
 
 def test_auto_exposure_is_told_from_a_locked_one(tmp_path: Path) -> None:

@@ -66,13 +66,16 @@ def test_where_no_mapping_with_the_lens_succeeds_its_fit_counts(tmp_path, clip, 
     assert (lens.width, lens.height) == (posed_clips.W, posed_clips.H)
 
 
-@pytest.mark.parametrize(("fov", "bends"), [(60, True), (30, True), (15, False)])
-def test_a_long_lens_does_not_bend(fov, bends):
+@pytest.mark.parametrize(
+    ("fov", "error_share", "bends"),
+    [(60, 0.8, True), (30, 0.8, True), (15, 0.8, False), (60, 0.9945, True), (60, 0.9968, False)],
+)
+def test_a_lens_bends_where_that_explains_the_clip_better_but_no_long_one(fov, error_share, bends):
     focal = 320 / np.tan(np.radians(fov / 2))
     camera = ColmapCamera("SIMPLE_PINHOLE", 640, 360, np.diag([focal, focal, 1]), np.zeros(0))
     nothing = np.zeros(0)
     model = ColmapModel({1: camera}, {}, nothing, np.zeros((0, 3)), nothing, nothing)
     k1 = 0.03 * (focal / 320) ** 2  # ten pixels at the corners, whatever the focal length
-    fit = sfm.LensFit({1: (focal, k1, 0.0)}, model_error_px=0.5, error_px=0.4)
+    fit = sfm.LensFit({1: (focal, k1, 0.0)}, model_error_px=0.5, error_px=0.5 * error_share)
     found = bent_cameras(fit, model, scale=1)
     assert [mapping.distortion for mapping in found] == ([(k1, 0.0)] if bends else [])

@@ -13,7 +13,9 @@ from hdr_nsff.check.facts import LensFacts
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.stack import spread_frames
 from hdr_nsff.priors.poses.estimate import PosesTuning, estimate_poses
+from hdr_nsff.priors.poses.lens import lens_fit, shows_lens
 from hdr_nsff.priors.poses.reconstruct import ReconstructionTuning
+from hdr_nsff.priors.poses.view_matches import EarlierRounds
 
 # frames that are mapped (hand-chosen: seconds, and enough for one lens)
 MAX_FRAMES = 16
@@ -26,23 +28,26 @@ MIN_REGISTERED_SHARE = 0.9
 
 def measure_lens(equalized: np.ndarray, clipped: np.ndarray, scale: float) -> LensFacts | None:
     """The distortion of frames at one brightness (T, H, W, 3); None where too few of
-    them can be mapped.
+    them can be mapped, or a lens explains them better but none is found.
 
     `clipped` (T, H, W) bool holds no information; `scale` is the pixels of the clip per
     pixel of these.
     """
     chosen = spread_frames(len(equalized), MAX_FRAMES)
+    earlier = EarlierRounds()
     with tempfile.TemporaryDirectory() as folder:
         try:
             poses = estimate_poses(
-                equalized[chosen], None, Path(folder), clipped[chosen], tuning=TUNING, lens="auto"
-            )
+                equalized[chosen], None, Path(folder), clipped[chosen], tuning=TUNING,
+                earlier=earlier, lens="auto",
+            )  # fmt: skip
         except InputError:
             return None
     if poses.parallax != "full" or poses.registered.mean() < MIN_REGISTERED_SHARE:
         return None
     if not poses.lenses:
-        return LensFacts(0.0, 0.0, 0.0)
+        fit = lens_fit(earlier)
+        return LensFacts(0.0, 0.0, 0.0) if fit is None or not shows_lens(fit) else None
     lens = poses.lenses[0]
     k1, k2, _, _ = lens.distortion
     corner = scale * lens.max_displacement_px()
