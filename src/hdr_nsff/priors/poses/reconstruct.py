@@ -1,8 +1,8 @@
 """Structure from motion on the views of a clip.
 
-pycolmap maps the views (`sfm.py`) incrementally, then globally, with and without
-leveled contrast, until enough of them register with a focal length that a lens can
-have.
+pycolmap maps the views (`sfm.py`) incrementally, from the focal length of a usual lens
+and of a long one, then globally, with and without leveled contrast, until enough of
+them register with a focal length that a lens can have.
 """
 
 from __future__ import annotations
