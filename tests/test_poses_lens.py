@@ -37,12 +37,13 @@ def test_the_distortion_of_a_clip_is_found(tmp_path, clip):
 def test_a_lens_is_found_from_the_poses_of_the_pinhole_camera(tmp_path, clip, monkeypatch):
     tasks = []
 
-    def run(job):
-        tasks.append(job.task)
-        return map_images(job)
+    def run(jobs, at_once):
+        for job, models in zip(jobs, map_images(jobs, at_once), strict=True):
+            tasks.append(job.task)
+            yield models
 
-    map_images = sfm.run
-    monkeypatch.setattr(sfm, "run", run)
+    map_images = sfm.run_in_turn
+    monkeypatch.setattr(sfm, "run_in_turn", run)
     bent = np.stack([distorted_picture(frame, posed_clips.K, LENS) for frame in clip])
     assert estimate_poses(bent, None, tmp_path, threads=1, lens="auto").lenses
     assert tasks == ["incremental", "adjust"]

@@ -103,13 +103,14 @@ def test_failure_names_the_lens_or_the_frames():
 def test_no_more_mappings_than_allowed_are_tried(tmp_path, monkeypatch, limit, tried):
     jobs = []
 
-    def fail(job):
-        jobs.append(job.task)
-        raise sfm.SfmError("nothing matches")
+    def fail(tries, at_once):
+        for attempt in tries:
+            jobs.append(attempt.task)
+            yield sfm.SfmError("nothing matches")
 
     job = sfm.Job(str(tmp_path), [[]], [], 100.0, "match")
     monkeypatch.setattr(reconstruct, "write_job", lambda *_: job)
-    monkeypatch.setattr(sfm, "run", fail)
+    monkeypatch.setattr(sfm, "run_in_turn", fail)
     tuning = ReconstructionTuning(max_attempts=limit)
     with pytest.raises(InputError, match="nothing matches"):
         best_model(views_of(5), tmp_path, 1, "sift", tuning)

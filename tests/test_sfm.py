@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def test_a_worker_that_crashes_reports_why(tmp_path):
     (tmp_path / "images").mkdir()
     job = sfm.Job(str(tmp_path), [["missing.png"]], [], 100.0, "nonsense")  # type: ignore[arg-type]
     with pytest.raises(sfm.SfmError):
-        sfm.run(job)
+        sfm.run_worker(job)
 
 
 def test_a_worker_does_not_outlive_its_parent(tmp_path):
@@ -72,6 +72,36 @@ def test_processes_find_the_matches_of_one(tmp_path):
     assert all(len(rows) > 50 for rows in matches[:5])
     for a, b in zip(keypoints + matches, others + other_matches, strict=True):
         assert np.array_equal(a, b)
+
+
+FAILS_OR_SLEEPS = """
+import json, os, pathlib, sys, time
+job = json.loads(pathlib.Path(sys.argv[1]).read_text())
+if job["focal"] < 3:
+    sys.exit(f"no models at {job['focal']:.0f}")
+pathlib.Path(job["folder"], "pid").write_text(str(os.getpid()))
+time.sleep(60)
+"""
+
+
+def test_jobs_fail_in_their_order_and_those_that_work_ahead_are_stopped(tmp_path, monkeypatch):
+    (tmp_path / "fails_or_sleeps.py").write_text(FAILS_OR_SLEEPS)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *sys.path]))
+    monkeypatch.setattr(sfm, "WORKER", "fails_or_sleeps")
+    jobs = [sfm.Job(str(tmp_path), [], [], float(focal), "global") for focal in (1, 2, 3)]
+    results = sfm.run_in_turn(jobs, 2)
+    assert str(next(results)) == "no models at 1"
+    pid = tmp_path / "pid"
+    assert not pid.exists()  # the first works alone
+    assert str(next(results)) == "no models at 2"
+    for _ in range(100):
+        if pid.exists() and pid.read_text():
+            break
+        time.sleep(0.1)
+    worker = int(pid.read_text())
+    assert os.path.exists(f"/proc/{worker}")
+    results.close()
+    assert not os.path.exists(f"/proc/{worker}")
 
 
 FULL_DISK = """
@@ -125,9 +155,10 @@ def test_a_job_reaches_the_worker_unchanged(tmp_path):
     assert sfm.read_job(tmp_path / "job.json") == job
 
 
-def test_a_long_lens_is_found_from_the_guess_of_one(tmp_path):
-    pytest.importorskip("pycolmap")
-    size, count, focal = 320, 12, focal_length(11, 320)
+def write_seen_points(folder, focal, size, count=12):
+    """Names and named pairs of `count` images (none shows anything) of random points,
+    seen from an orbit; keypoints and matches are in `folder`.
+    """
     rng = np.random.default_rng(0)
     points = rng.uniform((-2, -2, 8), (2, 2, 16), (400, 3))
     angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
@@ -142,17 +173,40 @@ def test_a_long_lens_is_found_from_the_guess_of_one(tmp_path):
         rows = np.flatnonzero(((pixels > 0) & (pixels < size)).all(1))
         keypoints.append(pixels[rows])
         seen.append(rows)
-        write_png(tmp_path / "images" / name, np.zeros((size, size, 3)))
+        write_png(folder / "images" / name, np.zeros((size, size, 3)))
     pairs = [(a, b) for a in range(count) for b in range(a + 1, count)]
     matches = [
         np.stack(np.intersect1d(seen[a], seen[b], return_indices=True)[1:], 1) for a, b in pairs
     ]
     named = [(names[a], names[b]) for a, b in pairs]
-    sfm.write_matches(tmp_path, names, keypoints, named, matches)
+    sfm.write_matches(folder, names, keypoints, named, matches)
+    return names, named
+
+
+def models_of(jobs, at_once):
+    return [[read_model(path) for path in paths] for paths in sfm.run_in_turn(jobs, at_once)]
+
+
+def test_a_long_lens_is_found_from_the_guess_of_one(tmp_path):
+    pytest.importorskip("pycolmap")
+    size, focal = 320, focal_length(11, 320)
+    names, named = write_seen_points(tmp_path, focal, size)
     job = sfm.Job(str(tmp_path), [names], named, focal_length(60, size), "match")
     usual, long, held, _ = attempts(job, EarlierRounds(), focal_length(24, size))
-    found = [[read_model(folder) for folder in sfm.run(attempt)] for attempt in (usual, long, held)]
-    assert len(found[0][0].images) < count  # few at an absurd focal length come first
+    found = models_of([usual, long, held], 2)
+    assert len(found[0][0].images) < len(names)  # few at an absurd focal length come first
     for (model,) in found[1:]:
-        assert len(model.images) == count
+        assert len(model.images) == len(names)
         assert model.cameras[1].K[0, 0] == pytest.approx(focal, rel=0.03)
+
+
+@pytest.mark.parametrize("task", ["incremental", "global"])
+def test_every_mapping_of_the_same_matches_gives_the_same_model(tmp_path, task):
+    pytest.importorskip("pycolmap")
+    names, named = write_seen_points(tmp_path, 300.0, 320)
+    job = sfm.Job(str(tmp_path), [names], named, 277.0, task)
+    (alone,), (one,), (other,) = models_of([job, replace(job, focal=278.0), job], 2)
+    assert len(alone.images) == len(names)
+    for key, image in alone.images.items():
+        assert np.array_equal(image.c2w, other.images[key].c2w)
+        assert not np.array_equal(image.c2w, one.images[key].c2w)

@@ -68,7 +68,8 @@ def test_a_waving_cloth_bends_no_camera(tmp_path):
         threads=1,
     )
 
-    model = read_model(sfm.run(job)[0])
+    ((folder,),) = sfm.run_in_turn([job], 1)
+    model = read_model(folder)
 
     assert len(model.images) == FRAMES
     assert next(iter(model.cameras.values())).K[0, 0] == pytest.approx(FOCAL, rel=0.015)

@@ -2,7 +2,8 @@
 
 pycolmap maps the views (`sfm.py`) incrementally, from the focal length of a usual lens
 and of a long one, then globally, with and without leveled contrast, until enough of
-them register with a focal length that a lens can have.
+them register with a focal length that a lens can have. Where the first way fails, the
+others are tried side by side.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import shutil
 import tempfile
 import zlib
 from collections.abc import Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -19,6 +21,7 @@ import torch
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import encode
+from hdr_nsff.core.process import usable_cores
 from hdr_nsff.core.progress import say
 from hdr_nsff.core.stack import ArrayStack, Stack, spread_frames
 from hdr_nsff.core.tensors import CPU
@@ -185,6 +188,7 @@ def best_model(
     failures, tries_left = [], tuning.max_attempts
     longer_side = scale * max(views.images.shape[1:3])
     long_focal = focal_length(tuning.long_lens_fov_degrees, longer_side)
+    at_once = threads or usable_cores()
     for leftover in workdir.glob(".sfm-*"):
         shutil.rmtree(leftover, ignore_errors=True)
     workdir.mkdir(parents=True, exist_ok=True)
@@ -194,7 +198,8 @@ def best_model(
     for contrast, level_contrast in contrasts.items():
         if not tries_left:
             break
-        with tempfile.TemporaryDirectory(prefix=".sfm-", dir=workdir) as folder:
+        with ExitStack() as stack:
+            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix=".sfm-", dir=workdir))
             try:
                 job = write_job(
                     Path(folder), views, scale, level_contrast, threads, matcher, earlier,
@@ -204,14 +209,14 @@ def best_model(
             except sfm.SfmError as error:
                 failures.append(str(error))
                 continue
-            for attempt in attempts(job, earlier, long_focal)[:tries_left]:
+            tries = attempts(job, earlier, long_focal)[:tries_left]
+            results = stack.enter_context(closing(sfm.run_in_turn(tries, at_once)))
+            for attempt, folders in zip(tries, results, strict=True):
                 tries_left -= 1
-                try:
-                    folders = sfm.run(attempt)
-                    models = [read_model(p) for p in folders]
-                except sfm.SfmError as error:
-                    failures.append(str(error))
+                if isinstance(folders, sfm.SfmError):
+                    failures.append(str(folders))
                     continue
+                models = [read_model(p) for p in folders]
                 candidates = models if best is None else [best, *models]
                 best = max(candidates, key=lambda m: model_rank(m, count, tuning), default=None)
                 if best is not None and model_rank(best, count, tuning)[:2] == (True, True):

@@ -17,10 +17,12 @@ import sys
 import tempfile
 import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
+from itertools import islice
 from pathlib import Path
-from typing import IO, Literal
+from queue import SimpleQueue
+from typing import Literal
 
 import numpy as np
 
@@ -118,46 +120,105 @@ class SfmError(RuntimeError):
 
 
 def read_job(path: Path) -> Job:
-    """A job as `run` wrote it."""
+    """A job as `Worker` wrote it."""
     raw = json.loads(path.read_text())
     tuning = raw.pop("tuning")
     trimming = TrimmingTuning(**tuning.pop("trimming"))
     return Job(**raw, tuning=SfmTuning(**tuning, trimming=trimming))
 
 
-def run(job: Job) -> list[Path]:
-    """Map the images of `job` in a worker process, with progress; the folders of the
-    models it found, largest first. SfmError when it breaks down, OSError where the disk
-    is full.
-    """
-    run_worker(job)
-    return sorted(p for p in job.out.iterdir() if p.is_dir())
+class Worker:
+    """A worker process that does the task of a job."""
+
+    def __init__(self, job: Job) -> None:
+        self.job = job
+        file = job.out.with_suffix(".json")
+        file.write_text(json.dumps(asdict(job)))
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", WORKER, str(file)],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, errors="replace",
+        )  # fmt: skip
+        # read at once, so that a worker need not wait for others to be shown; errors in
+        # memory, as on a full disk a log would stay empty
+        self.messages: SimpleQueue[str] = SimpleQueue()
+        self.error_lines: deque[str] = deque(maxlen=20)
+        self.listeners = [
+            threading.Thread(target=self.listen, daemon=True),
+            threading.Thread(target=self.listen_to_errors, daemon=True),
+        ]
+        for listener in self.listeners:
+            listener.start()
+
+    def listen(self) -> None:
+        """Keep what the worker reports, and an empty line after the last one."""
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self.messages.put(line)
+        self.messages.put("")
+
+    def listen_to_errors(self) -> None:
+        """Keep the last lines of errors."""
+        assert self.process.stderr is not None
+        self.error_lines.extend(self.process.stderr)
+
+    def finish(self) -> None:
+        """Wait for the end, with progress. SfmError when the worker breaks down, OSError
+        where the disk is full.
+        """
+        show_progress(iter(self.messages.get, ""))
+        code = self.process.wait()
+        self.end()
+        check_free_space(Path(self.job.folder), " ".join(self.error_lines))
+        if code != 0:
+            messages = [line.strip() for line in self.error_lines if line.strip()]
+            raise SfmError(messages[-1] if messages else f"pycolmap ended with code {code}")
+
+    def end(self) -> None:
+        """Stop the worker, if it still works."""
+        self.process.kill()
+        self.process.wait()
+        for listener in self.listeners:
+            listener.join()
 
 
 def run_worker(job: Job) -> None:
-    """Do the task of `job` in a worker process, with progress; errors as of `run`."""
-    folder = Path(job.folder)
-    (folder / "job.json").write_text(json.dumps(asdict(job)))
-    command = [sys.executable, "-m", WORKER, str(folder / "job.json")]
-    worker = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, errors="replace"
-    )
-    assert worker.stdout is not None and worker.stderr is not None
-    # kept in memory: on a full disk a log would stay empty
-    error_lines: deque[str] = deque(maxlen=20)
-    listener = threading.Thread(target=error_lines.extend, args=(worker.stderr,), daemon=True)
-    listener.start()
+    """Do the task of `job` in a worker process; errors as of `Worker.finish`."""
+    worker = Worker(job)
     try:
-        show_progress(worker.stdout)
-        code = worker.wait()
+        worker.finish()
     finally:
-        worker.kill()
-        worker.wait()
-        listener.join()
-    check_free_space(folder, " ".join(error_lines))
-    if code != 0:
-        messages = [line.strip() for line in error_lines if line.strip()]
-        raise SfmError(messages[-1] if messages else f"pycolmap ended with code {code}")
+        worker.end()
+
+
+def run_in_turn(jobs: Sequence[Job], at_once: int) -> Iterator[list[Path] | SfmError]:
+    """Map the images of one folder by several `jobs`: of each, in their order, the
+    folders of the models it found, largest first, or why it broke down. OSError where
+    the disk is full.
+
+    The first job works alone, since most clips need no other; after that, `at_once` of
+    them work at a time. Close the iterator to stop those whose results are not needed.
+    """
+    ahead: deque[Worker] = deque()
+    rest = iter(jobs)
+    try:
+        for k in range(len(jobs)):
+            ahead.extend(Worker(job) for job in islice(rest, (at_once if k else 1) - len(ahead)))
+            worker = ahead[0]
+            try:
+                worker.finish()
+                result: list[Path] | SfmError = models_of(worker.job)
+            except SfmError as error:
+                result = error
+            ahead.popleft()
+            yield result
+    finally:
+        for worker in ahead:
+            worker.end()
+
+
+def models_of(job: Job) -> list[Path]:
+    """The folders of the models that a job left behind, largest first."""
+    return sorted(p for p in job.out.iterdir() if p.is_dir())
 
 
 def write_matches(
@@ -204,18 +265,18 @@ def check_free_space(folder: Path, worker_errors: str) -> None:
         os.fsync(file.fileno())
 
 
-def show_progress(lines: IO[str]) -> None:
+def show_progress(lines: Iterator[str]) -> None:
     """Show the worker's stages ("stage NAME TOTAL", then "tick" lines, then "end") as
     progress bars.
     """
 
     def ticks() -> Iterator[None]:
-        for line in iter(lines.readline, ""):
+        for line in lines:
             if line.startswith("end"):
                 return
             yield None
 
-    for line in iter(lines.readline, ""):
+    for line in lines:
         if line.startswith("stage "):
             _, name, total = line.split()
             for _ in track(ticks(), f"poses: {name}", int(total)):

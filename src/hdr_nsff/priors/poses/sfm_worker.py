@@ -16,6 +16,7 @@ pixels for one clip. It takes up to 1.2 times as long on two cores.
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -66,13 +67,7 @@ def reconstruct(job: Job, database: Path) -> None:
         case "adjust":
             models = {0: from_known_poses(job, database)}
         case _:
-            send("stage mapping", 1)
-            options = pycolmap.GlobalPipelineOptions()
-            options.num_threads = 1
-            options.random_seed = 0
-            pycolmap.calibrate_view_graph(database)
-            models = pycolmap.global_mapping(database, images, out, options)
-            send("end")
+            models = map_globally(database, images, out)
     models = {key: model for key, model in models.items() if len(model.points3D)}
     send("stage adjustment", (job.tuning.trimming.max_rounds + 1) * len(models))
     for key, model in models.items():
@@ -167,6 +162,24 @@ def map_incrementally(job: Job, database: Path) -> dict[int, Any]:
     return dict(models)
 
 
+def map_globally(database: Path, images: Path, out: Path) -> dict[int, Any]:
+    """Models of all images at once."""
+    pycolmap = load_pycolmap()
+    send("stage mapping", 1)
+    calibration = pycolmap.ViewGraphCalibrationOptions()
+    options = pycolmap.GlobalPipelineOptions()
+    mapper = options.mapper
+    parts = mapper.global_positioning, mapper.rotation_averaging, mapper.retriangulation
+    for seeded in (calibration, options, mapper, *parts):
+        seeded.random_seed = 0
+    options.num_threads = mapper.num_threads = 1
+    mapper.bundle_adjustment.ceres.solver_options.num_threads = 1
+    pycolmap.calibrate_view_graph(database, calibration)
+    models = pycolmap.global_mapping(database, images, out, options)
+    send("end")
+    return dict(models)
+
+
 def from_known_poses(job: Job, database: Path) -> Any:
     """The model of the poses in `job.start`, with points triangulated anew. Where its
     cameras are pinholes and those of the job are not, the poses first follow the lens.
@@ -232,12 +245,13 @@ def main() -> None:
     if job.task == "match":
         find_matches(job, folder / "features.db", job.threads or usable_cores())
         return
-    database = folder / "database.db"
-    if database.exists():
-        set_cameras(job, database)
-    else:
-        load_matches(job, database)
-    reconstruct(job, database)
+    verified, own = folder / "database.db", job.out.with_suffix(".db")
+    if not verified.exists():
+        load_matches(job, verified)
+    shutil.copy(verified, own)
+    set_cameras(job, own)
+    reconstruct(job, own)
+    own.unlink()
 
 
 if __name__ == "__main__":
