@@ -17,6 +17,7 @@ from hdr_nsff.priors.poses.estimate import estimate_poses
 from hdr_nsff.priors.poses.still_camera import (
     Detail,
     StillCameraTuning,
+    growth_of,
     nearly_still_shifts,
     shaken_background,
     shift_of,
@@ -83,6 +84,21 @@ def test_a_camera_that_moves_farther_does_not_shake():
     assert shaken_background(shaken(behind_a_box(), 4.0)) is None
     assert shaken_background(noisy(sliding(PLACES))) is None
     assert shaken_background(noisy(panning(np.linspace(-4, 4, NUM)))) is None
+
+
+def grown(video: np.ndarray, growths: np.ndarray) -> np.ndarray:
+    """The clip (T, H, W, 3) with every frame larger by a share (T,)."""
+    frames = []
+    for frame, g in zip(video, growths, strict=True):
+        matrix = np.array([[1 + g, 0, -g * W / 2], [0, 1 + g, -g * H / 2]])
+        frames.append(cv2.warpAffine(frame, matrix, (W, H), borderMode=cv2.BORDER_REFLECT))
+    return np.stack(frames)
+
+
+def test_a_camera_that_walks_towards_a_far_background_does_not_shake():
+    for growth, shakes in ((0.002, True), (0.01, False)):
+        clip = grown(shaken(behind_a_box(), 0.8), np.linspace(-growth, growth, NUM))
+        assert (shaken_background(clip) is not None) == shakes, growth
 
 
 def shaken_below(row: int, above: bool) -> np.ndarray:
@@ -229,6 +245,15 @@ def test_a_shift_comes_back(shift):
     background, moved = waves(x), waves(x - shift)
     assert shift_of(moved, background, np.ones((H, W), bool)) == pytest.approx(shift, abs=0.02)
     assert shift_of(moved, background, np.zeros((H, W), bool)) == np.inf
+
+
+@pytest.mark.parametrize("growth", [0.0, 0.003, 0.01])
+def test_a_growth_comes_back(growth):
+    x, y = np.meshgrid(np.arange(W), np.arange(H))
+    waves = lambda x, y: np.sin(x / 6) * np.cos(y / 8)  # noqa: E731
+    background, moved = waves(x, y), waves(x / (1 + growth) - 0.3, y / (1 + growth))
+    assert growth_of(moved, background, np.ones((H, W), bool)) == pytest.approx(growth, abs=5e-4)
+    assert growth_of(moved, background, np.zeros((H, W), bool)) == np.inf
 
 
 def test_detail_does_not_depend_on_contrast():

@@ -162,8 +162,8 @@ class Worker:
         self.error_lines.extend(self.process.stderr)
 
     def finish(self) -> None:
-        """Wait for the end, with progress. SfmError when the worker breaks down, OSError
-        where the disk is full.
+        """Wait for the end, with progress. SfmError when the worker breaks down,
+        OSError where the disk is full.
         """
         show_progress(iter(self.messages.get, ""))
         code = self.process.wait()

@@ -57,7 +57,6 @@ def reconstruct(job: Job, database: Path) -> None:
     """Map the matches; models are left in numbered folders, adjusted to the points that
     stand still.
     """
-    pycolmap = load_pycolmap()
     out = job.out
     out.mkdir(exist_ok=True)
     images = Path(job.folder) / "images"
