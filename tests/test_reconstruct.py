@@ -70,6 +70,12 @@ def test_a_lens_that_bends_strongly_may_be_wider():
     assert not has_plausible_lens(wide, tuning_for_lenses([bent(-0.005)]))
     assert has_plausible_lens(wide, tuning_for_lenses([bent(-0.1)]))
     assert not has_plausible_lens(model(60, 36), tuning_for_lenses([bent(-0.1)]))  # 127 degrees
+    # the lens that was found with the poses counts as well
+    K = np.array([[94, 0, 120], [0, 94, 68], [0, 0, 1.0]])
+    with_lens = ColmapCamera("RADIAL", 240, 136, K, np.array([-0.07, 0.0]))
+    assert has_plausible_lens(replace(wide, cameras={1: with_lens}))
+    folds_over = replace(with_lens, distortion=np.array([-0.4, 0.0]))
+    assert not has_plausible_lens(replace(wide, cameras={1: folds_over}))
     # two cameras, one of which is no wide one
     assert not has_plausible_lens(wide, tuning_for_lenses([bent(-0.1), bent(-0.005)]))
 

@@ -327,9 +327,17 @@ def tuning_for_lenses(
 def has_plausible_lens(
     model: ColmapModel, tuning: ReconstructionTuning = ReconstructionTuning()
 ) -> bool:
-    """Whether the focal lengths are those of real lenses."""
-    fov = [field_of_view(c.K[0, 0], c.width, c.height) for c in model.cameras.values()]
-    return all(tuning.min_fov_degrees <= f <= tuning.max_fov_degrees for f in fov)
+    """Whether the focal lengths are those of real lenses, which see more where they
+    bend strongly.
+    """
+    for camera in model.cameras.values():
+        k1, k2 = np.append(camera.distortion, [0.0, 0.0])[:2].tolist()
+        lens = Lens(camera.K, (k1, k2, 0.0, 0.0), camera.width, camera.height)
+        own = tuning_for_lenses([lens], tuning) if lens.is_one_to_one() else tuning
+        fov = field_of_view(camera.K[0, 0], camera.width, camera.height)
+        if not own.min_fov_degrees <= fov <= own.max_fov_degrees:
+            return False
+    return True
 
 
 def model_rank(

@@ -17,7 +17,7 @@ import sys
 import tempfile
 import threading
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -190,7 +190,7 @@ def run_worker(job: Job) -> None:
         worker.end()
 
 
-def run_in_turn(jobs: Sequence[Job], at_once: int) -> Iterator[list[Path] | SfmError]:
+def run_in_turn(jobs: Sequence[Job], at_once: int) -> Generator[list[Path] | SfmError]:
     """Map the images of one folder by several `jobs`: of each, in their order, the
     folders of the models it found, largest first, or why it broke down. OSError where
     the disk is full.
