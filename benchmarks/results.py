@@ -331,7 +331,7 @@ SECTIONS = (
         "exposure), nothing given but the poses of the two and the GoPro's metadata. Measured on "
         "every eighth frame, of the two on other frames of the original. Moving pixels are those "
         "of the estimated masks. 2 minutes of training are on one thread, beside another run. "
-        "The last three rows are of commit 1f717a6a9, on Intel(R) Xeon(R) Processor.",
+        "`gopro` is the first 40 frames.",
         "hdr-nsff bench OUT --scenes CLIP,CLIP,... --methods splat --steps 800 --max-size 320 "
         "--views 0` and `--methods splat,grid --budget 2min --views 0 --jobs 2",
         bench_clips,
