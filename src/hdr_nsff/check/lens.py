@@ -17,7 +17,7 @@ from hdr_nsff.priors.poses.lens import lens_fit, shows_lens
 from hdr_nsff.priors.poses.reconstruct import ReconstructionTuning
 from hdr_nsff.priors.poses.view_matches import EarlierRounds
 
-# frames that are mapped (of ten clips, 16 took up to twice as long and left a GoPro's
+# frames that are mapped (of nine clips, 16 took up to twice as long and left a GoPro's
 # lens unfound, and that of a camera that walks)
 MAX_FRAMES = 12
 # where the first mapping fails, others take minutes and find a lens of few frames

@@ -73,7 +73,7 @@ class StillCameraTuning:
     max_shake_share: float = 0.01
     # and does not grow by more than this in half of the frames, as far things do before
     # a camera that walks towards them (a GoPro's in 12 to 40 frames: 0.6 to 0.7 %;
-    # eight clips that shake or turn: 0.17 % at most)
+    # nine clips that shake, turn or stand still: 0.17 % at most)
     max_growth: float = 0.003
     detail: LocalDetailTuning = field(default_factory=LocalDetailTuning)
 
