@@ -1,13 +1,11 @@
-"""The page in headless Chromium: it sees what `render` sees, alone and with a server.
+"""The page in headless Chromium: it sees what `render` sees.
 Skipped, in a loud line, where there is no Chromium.
 """
 
 from __future__ import annotations
 
 import base64
-import threading
 import warnings
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,18 +13,15 @@ import numpy as np
 import pytest
 import torch
 from browser import Page, find_browser
-from test_served_run import save_run
 from viewer_scenes import render, scene_file, trained, trained_local, with_gap
 from viewer_tab import SIZE, TO_BASE64, open_page, png_text, read_linear, read_png, state, view_of
 
 from hdr_nsff.fields.splat.rasterize import rasterize
 from hdr_nsff.maths.metrics import mu_law_psnr
-from hdr_nsff.rendering.served_run import ServedRun
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.base import ToneMapConfig
 from hdr_nsff.tonemap.build import tone_mapper_for
 from hdr_nsff.viewer.field_scene import scene_of
-from hdr_nsff.viewer.server import MAX_PIXELS, ViewerServer
 
 if find_browser() is None:
     MISSING = "NO CHROMIUM: THE VIEWER'S PAGE IS NOT TESTED; install it, or set CHROMIUM"
@@ -225,79 +220,3 @@ def test_another_tab_says_nothing_about_the_speed(viewer: Page) -> None:
     assert viewer.run(run.format(turns.format(1, 5000) + turns.format(4, 16))) is False
     assert viewer.run("viewer.frameTimes.length") == 5
     assert viewer.run(run.format(turns.format(8, 700))) is True  # a slow GPU always pauses
-
-
-# With a server
-
-
-@pytest.fixture(params=["splat"])
-def address(
-    request: pytest.FixtureRequest, toy: Scene, toy_folder: Path, tmp_path: Path
-) -> Iterator[str]:
-    """Where a run of a preset is served."""
-    save_run(toy, toy_folder, tmp_path / "run", request.param)
-    with ViewerServer(ServedRun(tmp_path / "run", "cpu")) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield server.address
-        server.shutdown()
-
-
-@pytest.mark.parametrize("address", ["splat", "grid"], indirect=True)
-def test_a_browser_without_a_gpu_shows_frames_of_the_server(tab: Page, address: str) -> None:
-    tab.goto(address, 500, 300)
-    tab.wait("!document.getElementById('frame').hidden")
-    tab.press("ArrowRight")
-    tab.drag((120, 100), (160, 110))
-    tab.press("v")
-    tab.wait("!viewer.frames.busy && viewer.frames.shown > 2")
-    width = tab.run("document.getElementById('frame').naturalWidth")
-    assert width == tab.run("viewer.scene.width")  # the finest, after coarse ones
-    assert tab.run("document.querySelector('#curve [value^=agx]').disabled") is True
-    assert all(asked.startswith(address) for asked in tab.requests())
-    assert tab.problems() == []
-
-
-def test_frames_of_the_server_are_never_too_large(tab: Page, address: str) -> None:
-    tab.goto(address, 500, 300)
-    tab.wait("!viewer.frames.busy && viewer.frames.shown > 0")
-    tab.run(
-        "(() => { const { frames } = viewer; frames.maxPixels = 700; frames.shown = 0;"
-        "frames.request(viewer.view(), viewer.state); })()"
-    )
-    tab.wait("!viewer.frames.busy && viewer.frames.shown > 0")
-    width, height = tab.run(
-        "(image => [image.naturalWidth, image.naturalHeight])(document.getElementById('frame'))"
-    )
-    assert 600 < width * height <= 700
-    assert tab.run("JSON.parse(document.getElementById('settings').textContent).max_pixels") == (
-        MAX_PIXELS
-    )
-
-
-def test_a_browser_that_draws_too_slowly_asks_the_server(tab: Page, address: str) -> None:
-    tab.goto(f"{address}#draw", 500, 300)
-    tab.run(
-        "viewer.renderer.composite = (draw => function (...view) {"
-        "for (const end = performance.now() + 250; performance.now() < end;);"
-        "return draw.apply(this, view); })(viewer.renderer.composite)"
-    )
-    tab.press(" ")
-    tab.wait("viewer.frames?.shown > 0")
-    assert tab.run("viewer.renderer") is None
-    tab.press(" ")
-    tab.wait("!viewer.frames.busy")
-    assert tab.problems() == []
-
-
-def test_a_served_page_can_draw_and_follows_the_run(
-    tab: Page, address: str, tmp_path: Path
-) -> None:
-    tab.goto(f"{address}#draw", 500, 300)
-    assert tab.run("viewer.renderer.visible") > 400
-    tab.press("ArrowRight")
-    (checkpoint,) = (tmp_path / "run" / "checkpoints").iterdir()
-    checkpoint.rename(checkpoint.with_name("step_00000009.safetensors"))
-    tab.run("globalThis.scene = viewer.scene")
-    tab.wait("viewer.scene !== scene")
-    assert state(tab, "time") == 1
-    assert tab.problems() == []

@@ -27,6 +27,8 @@ async function loadScene() {
 
 async function start() {
   const settings = JSON.parse(held("settings"));
+  // asked first: the scene is of this version, or of a newer one
+  const version = settings.server ? await fetchVersion() : null;
   const scene = await loadScene();
   const player = new Player(scene, find("canvas"));
   globalThis.viewer = player; // for scripts and tests
@@ -45,7 +47,7 @@ async function start() {
     requestAnimationFrame(loop);
   };
   requestAnimationFrame(loop);
-  if (settings.server) followVersion(player);
+  if (settings.server) followVersion(player, version);
   document.body.dataset.ready = "yes";
 }
 
@@ -95,18 +97,24 @@ function showFrames(player, { max_pixels: maxPixels }) {
   limitControls();
 }
 
+/** The version of the server's scene. */
+async function fetchVersion() {
+  const response = await fetch("version");
+  if (!response.ok) throw new Error(`The server has no scene (${response.status}).`);
+  return response.text();
+}
+
 /** Load the scene again whenever the server has a newer one: a run that is training. */
-async function followVersion(player) {
-  let version = null;
+async function followVersion(player, version) {
   for (;;) {
+    await new Promise((done) => setTimeout(done, FOLLOW_MILLISECONDS));
     try {
-      const found = await (await fetch("version")).text();
-      if (version !== null && found !== version) await player.replace(await loadScene());
+      const found = await fetchVersion();
+      if (found !== version) await player.replace(await loadScene());
       version = found;
     } catch {
       return; // the server has stopped; the scene is here already
     }
-    await new Promise((done) => setTimeout(done, FOLLOW_MILLISECONDS));
   }
 }
 

@@ -1,0 +1,111 @@
+"""The page with a server behind it, in headless Chromium: it follows a run that trains,
+and a browser without a GPU shows frames of the server. Skipped where there is no
+Chromium.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from browser import Page, find_browser
+from test_served_run import save_run, save_step
+from viewer_tab import state
+
+from hdr_nsff.rendering.served_run import ServedRun
+from hdr_nsff.scene.scene import Scene
+from hdr_nsff.viewer.server import MAX_PIXELS, ViewerServer
+
+if find_browser() is None:
+    pytest.skip("no Chromium", allow_module_level=True)
+
+
+@pytest.fixture(params=["splat"])
+def address(
+    request: pytest.FixtureRequest, toy: Scene, toy_folder: Path, tmp_path: Path
+) -> Iterator[str]:
+    """Where a run of a preset is served."""
+    save_run(toy, toy_folder, tmp_path / "run", request.param)
+    with ViewerServer(ServedRun(tmp_path / "run", "cpu")) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield server.address
+        server.shutdown()
+
+
+@pytest.mark.parametrize("address", ["splat", "grid"], indirect=True)
+def test_a_browser_without_a_gpu_shows_frames_of_the_server(tab: Page, address: str) -> None:
+    tab.goto(address, 500, 300)
+    tab.wait("!document.getElementById('frame').hidden")
+    tab.press("ArrowRight")
+    tab.drag((120, 100), (160, 110))
+    tab.press("v")
+    tab.wait("!viewer.frames.busy && viewer.frames.shown > 2")
+    width = tab.run("document.getElementById('frame').naturalWidth")
+    assert width == tab.run("viewer.scene.width")  # the finest, after coarse ones
+    assert tab.run("document.querySelector('#curve [value^=agx]').disabled") is True
+    assert all(asked.startswith(address) for asked in tab.requests())
+    assert tab.problems() == []
+
+
+def test_frames_of_the_server_are_never_too_large(tab: Page, address: str) -> None:
+    tab.goto(address, 500, 300)
+    tab.wait("!viewer.frames.busy && viewer.frames.shown > 0")
+    tab.run(
+        "(() => { const { frames } = viewer; frames.maxPixels = 700; frames.shown = 0;"
+        "frames.request(viewer.view(), viewer.state); })()"
+    )
+    tab.wait("!viewer.frames.busy && viewer.frames.shown > 0")
+    width, height = tab.run(
+        "(image => [image.naturalWidth, image.naturalHeight])(document.getElementById('frame'))"
+    )
+    assert 600 < width * height <= 700
+    assert tab.run("JSON.parse(document.getElementById('settings').textContent).max_pixels") == (
+        MAX_PIXELS
+    )
+
+
+def test_a_browser_that_draws_too_slowly_asks_the_server(tab: Page, address: str) -> None:
+    tab.goto(f"{address}#draw", 500, 300)
+    tab.run(
+        "viewer.renderer.composite = (draw => function (...view) {"
+        "for (const end = performance.now() + 250; performance.now() < end;);"
+        "return draw.apply(this, view); })(viewer.renderer.composite)"
+    )
+    tab.press(" ")
+    tab.wait("viewer.frames?.shown > 0")
+    assert tab.run("viewer.renderer") is None
+    tab.press(" ")
+    tab.wait("!viewer.frames.busy")
+    assert tab.problems() == []
+
+
+def test_a_served_page_can_draw_and_follows_the_run(
+    tab: Page, address: str, tmp_path: Path
+) -> None:
+    tab.goto(f"{address}#draw", 500, 300)
+    assert tab.run("viewer.renderer.visible") > 400
+    tab.press("ArrowRight")
+    (checkpoint,) = (tmp_path / "run" / "checkpoints").iterdir()
+    checkpoint.rename(checkpoint.with_name("step_00000009.safetensors"))
+    tab.run("globalThis.scene = viewer.scene")
+    tab.wait("viewer.scene !== scene")
+    assert state(tab, "time") == 1
+    assert tab.problems() == []
+
+
+def test_a_checkpoint_that_is_newer_than_the_server_is_shown(
+    tab: Page, toy: Scene, toy_folder: Path, tmp_path: Path
+) -> None:
+    run = save_run(toy, toy_folder, tmp_path / "run")
+    with ViewerServer(ServedRun(tmp_path / "run", "cpu")) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        with torch.no_grad():
+            run.field.get_parameter("background").fill_(-1.0)  # type: ignore[attr-defined]
+        save_step(run, 9)
+        tab.goto(f"{server.address}#draw", 500, 300)
+        assert tab.run("viewer.scene.background") == pytest.approx([np.exp(-1)] * 3)
+        server.shutdown()
