@@ -97,6 +97,22 @@ def test_a_served_page_can_draw_and_follows_the_run(
     assert tab.problems() == []
 
 
+def test_a_page_follows_the_run_after_a_look_that_failed(
+    tab: Page, address: str, tmp_path: Path
+) -> None:
+    tab.goto(f"{address}#draw", 500, 300)
+    tab.run(
+        "(real => { globalThis.asked = 0; globalThis.fetch = (...what) => asked++ < 2"
+        " ? Promise.reject(new TypeError('unreachable')) : real(...what); })(fetch);"
+        "(real => { globalThis.setTimeout = (call, ms) => real(call, ms / 20); })(setTimeout)"
+    )
+    (checkpoint,) = (tmp_path / "run" / "checkpoints").iterdir()
+    checkpoint.rename(checkpoint.with_name("step_00000009.safetensors"))
+    tab.run("globalThis.scene = viewer.scene")
+    tab.wait("viewer.scene !== scene")
+    assert tab.run("asked") == 4  # two that failed, the version, the scene
+
+
 def test_a_checkpoint_that_is_newer_than_the_server_is_shown(
     tab: Page, toy: Scene, toy_folder: Path, tmp_path: Path
 ) -> None:

@@ -10,6 +10,7 @@ import { connectControls, find, limitControls, note, offerExtended } from "./con
 
 const WORKER = "sorter.js";
 const FOLLOW_MILLISECONDS = 5000; // between two looks at the version of the scene
+const MAX_FAILURES = 3; // of such looks in a row: then the server has stopped
 const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
 
 /** The page's settings, or the text of a source file that the page holds. */
@@ -106,14 +107,15 @@ async function fetchVersion() {
 
 /** Load the scene again whenever the server has a newer one: a run that is training. */
 async function followVersion(player, version) {
-  for (;;) {
+  for (let failures = 0; failures < MAX_FAILURES; ) {
     await new Promise((done) => setTimeout(done, FOLLOW_MILLISECONDS));
     try {
       const found = await fetchVersion();
       if (found !== version) await player.replace(await loadScene());
       version = found;
+      failures = 0;
     } catch {
-      return; // the server has stopped; the scene is here already
+      failures++; // the scene of before is here already
     }
   }
 }
