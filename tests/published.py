@@ -17,6 +17,7 @@ from hdr_nsff.scene.scene import Scene
 
 RAYS = 5
 TIME = 2  # of the batch
+SIDES = ((0, 1), (1, -1))  # columns of scene flow, and the neighbors that they lead to
 
 
 @dataclass
@@ -28,6 +29,10 @@ class Case:
     base: BranchPass
     scene_flow: SceneFlowPass
     terms: dict[str, Tensor]
+
+    @property
+    def knot(self) -> int:
+        return round(self.base.knot)
 
     @property
     def num_samples(self) -> int:
@@ -43,19 +48,19 @@ class Case:
         return self.scene_flow.flow[i * self.num_samples + k, side].tolist()
 
 
-def paper_case(scene: Scene) -> Case:
-    """Rays of frame `TIME`, with a chain forward."""
+def paper_case(scene: Scene, frame: int = TIME, chain: int = 1) -> Case:
+    """Rays of a training frame, with a chain forward (1) or backward (-1)."""
     field = paper_field(scene)
-    batch = draw_pixels(scene, TIME, RAYS, 0, torch.Generator().manual_seed(1))
-    batch = replace(in_float64(batch), chain=1)
+    batch = draw_pixels(scene, frame, RAYS, 0, torch.Generator().manual_seed(1))
+    batch = replace(in_float64(batch), chain=chain)
     base = field.query(batch, motion=True)
     scene_flow = SceneFlowPass(field, field.to_flow, batch, base)
     return Case(field, batch, base, scene_flow, field(batch)[1])
 
 
-def paper_field(scene: Scene) -> NSFF:
-    """The field, without noise of its density."""
-    field = random_field("paper", scene)
+def paper_field(scene: Scene, preset: str = "paper") -> NSFF:
+    """The field of `paper`, or of a preset like it, without noise of its density."""
+    field = random_field(preset, scene)
     assert isinstance(field, NSFF)
     field.config = replace(field.config, density_noise=0.0)
     return field.double()

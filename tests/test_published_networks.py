@@ -9,10 +9,12 @@ import torch
 from presets import random_field
 from published import (
     RAYS,
+    SIDES,
     TIME,
     Case,
     add,
     answer,
+    decode,
     disocclusion_of,
     flow_of,
     paper_case,
@@ -86,7 +88,7 @@ def test_warped_renders_are_eq_2_and_3_for_both_neighbors_and_the_chain(case: Ca
         places = [x for ray, _, x in samples_of(case) if ray == i]
         here = [raw_at(case, x, TIME, i) for x in places]
         hidden = {}
-        for side, offset in ((0, 1), (1, -1)):
+        for side, offset in SIDES:
             moved = [add(x, flow_of(raw, side)) for x, raw in zip(places, here, strict=True)]
             there = [raw_at(case, x, TIME + offset, i) for x in moved]
             _, rgb = composite(case, i, there)
@@ -111,11 +113,11 @@ def test_scene_flow_is_rendered_with_the_dynamic_branchs_own_weights(case: Case)
         places = [x for ray, _, x in samples_of(case) if ray == i]
         here = [raw_at(case, x, TIME, i) for x in places]
         weights, _ = composite(case, i, here)
-        total = torch.zeros(3, dtype=torch.float64)
-        for w, x, raw in zip(weights, places, here, strict=True):
-            ends = torch.tensor([x, add(x, flow_of(raw, 0))], dtype=torch.float64)
-            start, end = case.field.space.decode(ends)
-            total += w * (end - start)
-        torch.testing.assert_close(render.scene_flow[1][i].detach(), total)
+        for side, offset in SIDES:
+            total = torch.zeros(3, dtype=torch.float64)
+            for w, x, raw in zip(weights, places, here, strict=True):
+                moved = decode(case, add(x, flow_of(raw, side)))
+                total += w * (moved - decode(case, x))
+            torch.testing.assert_close(render.scene_flow[offset][i].detach(), total)
     share = case.base.weights.dynamic.sum(-1)  # of the blended render, eq. 6
     torch.testing.assert_close(render.motion, share)
