@@ -219,8 +219,9 @@ class SceneFlowPass:
     def regularizers(self) -> dict[str, Tensor]:
         """Regularizers by the names of `SceneFlowLosses`, means over dynamic samples.
 
-        Cycle, smoothness and disocclusion have one value per neighbor, kinetic energy
-        up to four (`kinetic`): the objective adds them up or averages them.
+        Cycle and smoothness have one value per neighbor, kinetic energy up to four
+        (`kinetic`): the objective adds them up or averages them. Disocclusion has two,
+        also at the ends of a clip, as published.
         """
         if not len(self.base.index):
             return {}
