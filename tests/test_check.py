@@ -14,7 +14,7 @@ from toy_scene import EV, ToyScene
 from hdr_nsff.check import lens, measure
 from hdr_nsff.check.check import CheckConfig, check
 from hdr_nsff.check.facts import CameraFacts, ClipFacts, ExposureFacts, FileFacts, LensFacts
-from hdr_nsff.check.findings import judge, outlook
+from hdr_nsff.check.findings import Finding, judge, outlook
 from hdr_nsff.check.measure import measure_clip
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import read_image, write_png
@@ -143,9 +143,11 @@ def test_given_exposures_are_taken_as_they_are(tmp_path: Path) -> None:
     rows = [f"{t},{ev}" for t, ev in enumerate(evs)]
     (clip / "exposures.csv").write_text("\n".join(["frame,ev", *rows]))
     facts, _, brackets = measure_clip(clip)
-    assert facts.exposure.given == "exposures.csv" and brackets == list(range(8))
-    assert facts.exposure.ev == (7, 6, 5, 4, 3, 2, 1, 0)
-    assert facts.exposure.white_share[7] == 0 and outlook(facts)["HDR"] == "yes"
+    assert facts.exposure.given == "exposures.csv" and brackets == [0] * 8  # as `prepare`
+    assert facts.exposure.given_drift_ev == 7 and not facts.exposure.contradictions
+    assert outlook(facts)["HDR"] == "yes"
+    (exposure, *_) = (finding for finding in judge(facts) if finding.subject == "exposure")
+    assert exposure.level == "good" and "range over 7.0 EV, in no cycle" in exposure.text
     # rows in any order, but all of them
     (clip / "exposures.csv").write_text("\n".join(["frame,ev", *rows[::-1]]))
     assert measure_clip(clip)[0].exposure == facts.exposure
@@ -160,6 +162,51 @@ def test_given_exposures_that_do_not_change_are_no_alternation() -> None:
     found = judge(replace(good, exposure=replace(constant, white_share=(0.0,), black_share=(0.0,))))
     (exposure,) = (finding for finding in found if finding.subject == "exposure")
     assert exposure.level == "problem" and exposure.advice
+
+
+def listed(clip: Path, evs: list[float]) -> list[Finding]:
+    """The findings on the exposure of a clip whose list says `evs`."""
+    rows = [f"{t},{ev}" for t, ev in enumerate(evs)]
+    (clip / "exposures.csv").write_text("\n".join(["frame,ev", *rows]))
+    facts, _, _ = measure_clip(clip)
+    works = Finding("note", "HDR", outlook(facts)["HDR"])
+    return [works, *(f for f in judge(facts) if f.subject == "exposure")]
+
+
+def test_a_list_of_auto_exposure_is_no_list_of_brackets(tmp_path: Path) -> None:
+    drift = [0.1 * t - 0.6 for t in range(FRAMES)]
+    works, given, *_ = listed(clip_of(tmp_path / "a", still_scene, drift), drift)
+    assert works.text.startswith("partly: the exposure drifts by about 1.1 EV")
+    assert given.level == "warning" and "gives drift by 1.10 EV: auto exposure" in given.text
+    both = [ev + 2.0 * (t % 2) for t, ev in enumerate(drift)]
+    works, given, *_ = listed(clip_of(tmp_path / "b", still_scene, both), both)
+    assert works.text == "yes" and given.level == "good"
+    assert "2 exposures are given by exposures.csv, 2.0 EV in all, which drift" in given.text
+
+
+@pytest.mark.parametrize(
+    ("recorded", "given", "problem"),
+    [
+        ([0.0, -2.0], [0.0, 0.0], "do not alternate, but the brightness repeats every 2"),
+        ([0.0, -2.0], [-2.0, 0.0], "go the way the brightness goes"),
+        ([0.0, 0.0], [0.0, -2.0], "all frames are about equally bright"),
+    ],
+)
+def test_a_list_that_the_pixels_contradict_is_reported(
+    tmp_path: Path, recorded: list[float], given: list[float], problem: str
+) -> None:
+    clip = clip_of(tmp_path, still_scene, recorded * (FRAMES // 2))
+    works, exposure, contradiction, *_ = listed(clip, given * (FRAMES // 2))
+    assert works.text == "unknown: exposures.csv and the pixels disagree"
+    assert exposure.level == "note"
+    assert problem in contradiction.text and "--exposures auto" in contradiction.advice
+
+
+def test_a_list_that_drifts_the_wrong_way_is_reported(tmp_path: Path) -> None:
+    drift = [0.1 * t - 0.6 for t in range(FRAMES)]
+    works, _, contradiction, *_ = listed(clip_of(tmp_path, still_scene, drift), drift[::-1])
+    assert works.text.startswith("unknown")
+    assert "a given drift of 1.1 EV changes points of the scene like -1.1" in contradiction.text
 
 
 def test_the_picture_of_check_is_no_frame(tmp_path: Path) -> None:

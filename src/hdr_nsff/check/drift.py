@@ -27,6 +27,17 @@ class DriftTuning:
     reweightings: int = 8
     least_error_ev: float = 0.02  # smaller errors of a pair count alike
     max_disagreement: float = 0.15  # of pairs, relative to the drift: else it is motion
+    min_given_ev: float = 0.3  # range of given exposures that pixels can be held against
+    max_ev_ratio: float = 2.0  # by which they may be off: a camera has no gamma of 2.2
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Levels of frames on which pairs of them agree, in EV under a gamma of 2.2."""
+
+    frames: list[int]
+    ev: np.ndarray  # (N,) of these frames, up to a constant
+    disagreement: float  # median over pairs, EV
 
 
 @dataclass(frozen=True)
@@ -35,6 +46,7 @@ class Drift:
 
     exposure_ev: float
     color_ev: float  # of red or blue against green
+    levels: Levels | None = None  # of the exposure; None where no frames are linked
 
 
 def measure_drift(
@@ -71,7 +83,33 @@ def measure_drift(
             known_colors.append((pair.i, pair.j))
     red_blue = np.array(colors).reshape(-1, 2)
     color_ranges = [range_over_frames(known_colors, red_blue[:, c], tuning) for c in (0, 1)]
-    return Drift(range_over_frames(known, np.array(exposures), tuning), max(color_ranges))
+    pairs = [(int(chosen[i]), int(chosen[j])) for i, j in known]
+    levels = levels_of_frames(pairs, np.array(exposures), tuning)
+    return Drift(range_of_levels(levels, tuning), max(color_ranges), levels)
+
+
+def drift_contradictions(
+    drift: Drift, given: list[float], tuning: DriftTuning = DriftTuning()
+) -> list[str]:
+    """What the levels of frames contradict in the `given` EV of all frames: a sentence,
+    none where they agree, or show nothing.
+    """
+    levels = drift.levels
+    if levels is None:
+        return []
+    listed = np.array(given)[levels.frames]
+    span = float(np.ptp(listed))
+    unsure = levels.disagreement > tuning.max_disagreement * span
+    if span < tuning.min_given_ev or unsure:
+        return []
+    listed = listed - listed.mean()
+    ratio = float(levels.ev @ listed / (listed @ listed))
+    if 1 / tuning.max_ev_ratio < ratio < tuning.max_ev_ratio:
+        return []
+    return [
+        f"a given drift of {span:.1f} EV changes points of the scene like {ratio * span:.1f} EV "
+        "(measured with a gamma of 2.2)"
+    ]
 
 
 def is_recorded(before: np.ndarray, after: np.ndarray, tuning: DriftTuning) -> np.ndarray:
@@ -85,12 +123,29 @@ def range_over_frames(
 ) -> float:
     """The range in EV over frames of what `pairs` of these differ by (P,), in log2 of
     recorded values; 0 where the pairs contradict each other.
+    """
+    return range_of_levels(levels_of_frames(pairs, log2_ratios, tuning), tuning)
 
-    Least squares, reweighted to least absolute errors, agree on one level per frame.
+
+def range_of_levels(levels: Levels | None, tuning: DriftTuning) -> float:
+    """The range in EV of levels; 0 where pairs contradict each other, or link none."""
+    if levels is None:
+        return 0.0
+    drift = float(np.ptp(levels.ev))
+    return drift if levels.disagreement < tuning.max_disagreement * drift else 0.0
+
+
+def levels_of_frames(
+    pairs: list[tuple[int, int]], log2_ratios: np.ndarray, tuning: DriftTuning
+) -> Levels | None:
+    """One level per frame from what `pairs` of frames differ by (P,), in log2 of
+    recorded values; None where no pairs are known.
+
+    Least squares, reweighted to least absolute errors.
     """
     linked = sorted({t for pair in pairs for t in pair})
     if len(linked) < 2:
-        return 0.0
+        return None
     design = np.zeros((len(pairs), linked[-1] + 1))
     for row, (i, j) in enumerate(pairs):
         design[row, [i, j]] = -1, 1
@@ -101,9 +156,8 @@ def range_over_frames(
         level = np.linalg.lstsq(design * weights[:, None], change * weights, rcond=None)[0]
         error = np.abs(design @ level - change)
         weights = 1 / np.sqrt(np.maximum(error, tuning.least_error_ev))
-    drift = float(np.ptp(level[linked]))
     disagreement = float(np.median(np.abs(design @ level - change)))
-    return drift if disagreement < tuning.max_disagreement * drift else 0.0
+    return Levels(linked, level[linked], disagreement)
 
 
 def sample(image: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
-from hdr_nsff.check.facts import ClipFacts
+from hdr_nsff.check.facts import ClipFacts, ExposureFacts
 from hdr_nsff.footage.footage import INTERLACED, deinterlacing
 from hdr_nsff.prepare.length import offered_segments
 from hdr_nsff.prepare.work import PrepareConfig
@@ -67,11 +67,14 @@ def outlook(facts: ClipFacts) -> dict[str, str]:
     """What will work, by purpose: yes, partly or no, and why."""
     exposure, camera = facts.exposure, facts.camera
     varies = max(exposure.ev) >= MIN_STEP
+    drift = exposure.drift_ev if exposure.given is None else exposure.given_drift_ev
     hdr = "no: one exposure shows no light beyond its white"
-    if varies:
+    if exposure.contradictions:
+        hdr = f"unknown: {exposure.given} and the pixels disagree"
+    elif varies or jumps(exposure, FindingTuning()):
         hdr = "yes"
-    elif exposure.drift_ev > FindingTuning().max_drift_ev:
-        hdr = f"partly: the exposure drifts by about {exposure.drift_ev:.1f} EV"
+    elif drift > FindingTuning().max_drift_ev:
+        hdr = f"partly: the exposure drifts by about {drift:.1f} EV"
     views = {
         "parallax": "yes, near the filmed path",
         "rotation": "no: the camera only turns, so there is no depth",
@@ -90,11 +93,8 @@ def judge_exposure(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]
     """The cycle, or what is there instead."""
     exposure = facts.exposure
     ordered = sorted(exposure.ev)
-    if exposure.given is not None and ordered[-1] >= MIN_STEP:
-        text = (
-            f"{len(ordered)} exposures are given by {exposure.given}, {ordered[-1]:.1f} EV in all"
-        )
-        yield Finding("good", "exposure", text)
+    if exposure.given is not None:
+        yield from judge_given(exposure, exposure.given, tuning)
     elif exposure.cycle > 1:
         levels = ", ".join(f"{value:.1f}" for value in ordered)
         text = (
@@ -128,6 +128,39 @@ def judge_exposure(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]
         text = f"bands of about {exposure.banding_ev:.2f} EV run through the picture: mains flicker"
         advice = "use exposure times of 1/50 or 1/100 s (1/60 or 1/120 s where mains have 60 Hz)"
         yield Finding("warning", "flicker", text, advice)
+
+
+def judge_given(exposure: ExposureFacts, source: str, tuning: FindingTuning) -> Iterator[Finding]:
+    """What the exposures that a `source` gives are, and whether the pixels agree."""
+    count, span, drift = len(exposure.ev), max(exposure.ev), exposure.given_drift_ev
+    advice = ""
+    if span >= MIN_STEP:
+        level: Level = "good"
+        text = f"{count} exposures are given by {source}, {span:.1f} EV in all"
+        if drift > tuning.max_drift_ev:
+            text += f", which drift by {drift:.1f} EV: auto exposure"
+    elif jumps(exposure, tuning):
+        level = "good"
+        text = f"the exposures that {source} gives range over {drift:.1f} EV, in no cycle"
+    else:
+        level = "warning" if drift > tuning.max_drift_ev else "problem"
+        advice = "alternate two or three exposures"
+        text = f"one exposure is given by {source}"
+        if drift > 0:
+            text = f"the exposures that {source} gives drift by {drift:.2f} EV: auto exposure"
+        text += ", so light beyond its white is not recorded"
+    if exposure.contradictions:
+        level, advice = "note", ""
+    yield Finding(level, "exposure", text, advice)
+    for sentence in exposure.contradictions:
+        text = f"{source} and the pixels disagree: {sentence}"
+        advice = "correct it, or give `prepare` the option `--exposures auto` to go by brightness"
+        yield Finding("warning", "exposure", text, advice)
+
+
+def jumps(exposure: ExposureFacts, tuning: FindingTuning) -> bool:
+    """Whether exposures of no cycle are given that differ from frame to frame."""
+    return exposure.given_drift_ev > tuning.max_drift_ev and exposure.change_ev > MIN_STEP
 
 
 def judge_clipping(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:

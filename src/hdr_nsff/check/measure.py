@@ -10,8 +10,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hdr_nsff.check.drift import measure_drift
+from hdr_nsff.check.drift import drift_contradictions, measure_drift
 from hdr_nsff.check.facts import CameraFacts, CameraMotion, ClipFacts, ExposureFacts, FileFacts
+from hdr_nsff.check.given import GivenExposures, given_exposures
 from hdr_nsff.check.lens import measure_lens
 from hdr_nsff.check.shutter import measure_readout
 from hdr_nsff.core.errors import InputError
@@ -20,7 +21,6 @@ from hdr_nsff.core.stack import spread_frames
 from hdr_nsff.core.video import frame_times, video_info
 from hdr_nsff.footage.bars import with_bars
 from hdr_nsff.footage.cuts import find_cuts
-from hdr_nsff.footage.exposure_lists import ev_in_list, read_exif_ev, read_exposure_csv
 from hdr_nsff.footage.footage import Footage, open_footage
 from hdr_nsff.footage.frame_choice import check_frame_size
 from hdr_nsff.footage.ingest import MAX_FRAMES, read_frames
@@ -85,10 +85,12 @@ def measure_clip(
     if nothing is not None:
         raise InputError(f"{clip}: all frames are {nothing}; check that it plays")
     file = describe_file(footage)
-    source, given = given_exposures(footage, len(video))
-    gapped = find_cycle(exposure.brightness_steps(video), np.ones(len(video) - 1, int))
-    cycle = given_cycle(given) if source is not None else gapped.cycle
-    gaps = gapped.gaps if source is None else ()
+    given = given_exposures(footage, len(video))
+    if given is not None:
+        cycle, gaps = given.cycle()
+    else:
+        gapped = find_cycle(exposure.brightness_steps(video), np.ones(len(video) - 1, int))
+        cycle, gaps = gapped.cycle, gapped.gaps
     equalized, clipped = exposure.equalize(video, cycle.brackets)
     keypoints = detect_keypoints(equalized, clipped)
     following = match_pairs(keypoints, [(t, t + 1) for t in range(len(video) - 1)])
@@ -96,7 +98,7 @@ def measure_clip(
     facts = ClipFacts(
         file=file,
         looked_at=len(video),
-        exposure=measure_exposure(source, video, cycle, keypoints, gaps, tuning),
+        exposure=measure_exposure(given, video, cycle, keypoints, gaps, tuning),
         camera=measure_camera(equalized, clipped, cycle, keypoints, following, scale, tuning),
     )
     return facts, video, cycle.brackets
@@ -133,7 +135,7 @@ def describe_file(footage: Footage) -> FileFacts:
 
 
 def measure_exposure(
-    source: str | None,
+    given: GivenExposures | None,
     video: np.ndarray,
     cycle: exposure.Cycle,
     keypoints: list[Keypoints],
@@ -148,6 +150,10 @@ def measure_exposure(
     count = len(cycle.ev)
 
     drift = measure_drift(video, cycle, keypoints)
+    contradictions = []
+    if given is not None:
+        contradictions = exposure.contradictions(video, given.ev)
+        contradictions += drift_contradictions(drift, given.ev)
 
     def per_bracket(shares: np.ndarray) -> tuple[float, ...]:
         return tuple(round(float(shares[brackets == b].mean()), 4) for b in range(count))
@@ -156,7 +162,9 @@ def measure_exposure(
         cycle=cycle.length,
         ev=tuple(round(value, 2) for value in cycle.ev),
         explained=round(cycle.confidence, 3),
-        given=source,
+        given=None if given is None else given.source,
+        given_drift_ev=0.0 if given is None else round(given.drift(), 2),
+        contradictions=tuple(contradictions),
         change_ev=round(float(np.abs(steps).mean()), 3),
         drift_ev=round(drift.exposure_ev, 2),
         color_drift_ev=round(drift.color_ev, 2),
@@ -165,32 +173,6 @@ def measure_exposure(
         banding_ev=round(measure_banding(video, keypoints, cycle.length, tuning), 3),
         missing_before=gaps,
     )
-
-
-def given_exposures(footage: Footage, count: int) -> tuple[str | None, list[float]]:
-    """Where exposures are written down, and those of the first `count` frames."""
-    table = read_exposure_csv(footage)
-    if table is not None:
-        path, rows = table
-        names = list(footage.files)
-        sources = [f"{names[0]}#{i}" if footage.video else names[i] for i in range(count)]
-        given = [ev_in_list(path, rows, source, i) for i, source in enumerate(sources)]
-        return path.name, given
-    if footage.video:
-        return None, []
-    known = [read_exif_ev(path) for path in footage.cameras[0][:count]]
-    given = [ev for ev in known if ev is not None]
-    if len(given) < count or max(given) - min(given) < exposure.MIN_STEP:
-        return None, []
-    return "EXIF", given
-
-
-def given_cycle(given: list[float]) -> exposure.Cycle:
-    """The cycle of the EVs of frames as they are written down."""
-    brackets, ev = exposure.brackets_by_ev(given)
-    relative = [value - min(ev) for value in ev]
-    order = np.argsort(ev, kind="stable").tolist()
-    return exposure.Cycle(exposure.period(brackets), brackets, order, relative, 1.0)
 
 
 def measure_banding(

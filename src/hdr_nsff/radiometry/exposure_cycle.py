@@ -228,7 +228,10 @@ def contradictions(
         length = detect_cycle(video, tuning).length
         if length == 1:
             return []
-        return [f"one exposure is given, but the brightness repeats every {length} frames"]
+        return [
+            "the given exposures do not alternate, but the brightness repeats every "
+            f"{length} frames"
+        ]
     if np.abs(measured).mean() < tuning.min_step_ev:
         return [
             f"exposure steps of {np.abs(given).mean():.1f} EV are given, "

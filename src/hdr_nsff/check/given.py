@@ -1,0 +1,74 @@
+"""Exposures that are written down for the frames of a clip, as `prepare` takes them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hdr_nsff.footage.exposure_lists import ev_in_list, read_exif_ev, read_exposure_csv
+from hdr_nsff.footage.footage import Footage
+from hdr_nsff.radiometry import exposure_cycle as exposure
+from hdr_nsff.radiometry.dropped_frames import find_cycle
+
+
+@dataclass(frozen=True)
+class GivenExposures:
+    """Where the exposures of frames are written down, and what they are."""
+
+    source: str  # exposures.csv or EXIF
+    ev: list[float]  # (T,) to any reference
+
+    @property
+    def follows_no_cycle(self) -> bool:
+        """Whether they are too many for a cycle: auto exposure."""
+        return len(exposure.brackets_by_ev(self.ev)[1]) > exposure.MAX_CYCLE
+
+    def cycle(self) -> tuple[exposure.Cycle, tuple[int, ...]]:
+        """Their cycle, and the frames before which it skips some.
+
+        Of auto exposure, the cycle is that of an alternation below it, if any.
+        """
+        gapped = find_cycle(np.diff(self.ev), np.ones(len(self.ev) - 1, int))
+        if self.follows_no_cycle:
+            return gapped.cycle, gapped.gaps
+        brackets, ev = exposure.brackets_by_ev(self.ev)
+        relative = [value - min(ev) for value in ev]
+        order = np.argsort(ev, kind="stable").tolist()
+        length = exposure.period(brackets)
+        if gapped.gaps:
+            length = gapped.cycle.length
+        return exposure.Cycle(length, brackets, order, relative, 1.0), gapped.gaps
+
+    def drift(self) -> float:
+        """The range in EV by which auto exposure leaves the brackets of its cycle."""
+        if not self.follows_no_cycle:
+            return 0.0
+        brackets = np.array(self.cycle()[0].brackets)
+        left = np.array(self.ev)
+        for bracket in np.unique(brackets):
+            left[brackets == bracket] -= left[brackets == bracket].mean()
+        return float(np.ptp(left))
+
+
+def given_exposures(footage: Footage, count: int) -> GivenExposures | None:
+    """The exposures of the first `count` frames; None where none are written down, or
+    the EXIF of all frames has the same.
+
+    InputError for a list that is not understood, or lacks one of these frames.
+    """
+    table = read_exposure_csv(footage)
+    if table is not None:
+        path, rows = table
+        names = list(footage.files)
+        sources = [f"{names[0]}#{i}" if footage.video else names[i] for i in range(count)]
+        return GivenExposures(
+            path.name, [ev_in_list(path, rows, source, i) for i, source in enumerate(sources)]
+        )
+    if footage.video:
+        return None
+    known = [read_exif_ev(path) for path in footage.cameras[0][:count]]
+    found = [ev for ev in known if ev is not None]
+    if len(found) < count or max(found) - min(found) < exposure.MIN_STEP:
+        return None
+    return GivenExposures("EXIF", found)
