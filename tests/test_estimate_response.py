@@ -51,7 +51,19 @@ def test_unknown_exposures_come_with_their_interval() -> None:
     assert response.scale_low < 1 < response.scale_high
     words = describe(response, UNKNOWN)
     assert "95 % confidence" in words and "--ev" in words
-    assert response.moved_stops == 0 or "moved by" in words
+    assert response.moved_stops > 0.1  # the recordings alone give half a stop more
+    assert f"moved by {response.moved_stops:.2f} to usual steps" in words
+
+
+def test_steps_moved_to_usual_ones_are_named_with_their_number(measured: Response) -> None:
+    ev = np.array([-4.0, -2.0, 0.0])
+    guess = replace(measured, guessed=True, ev=ev, scale_low=0.9, scale_high=1.4)
+    longer = describe(replace(guess, measured_scale=1.125), UNKNOWN)
+    assert "give 4.50 from darkest to brightest, 3.60 to 5.60 with 95 % confidence" in longer
+    assert "moved by 0.50 to usual steps" in longer
+    shorter = describe(replace(guess, measured_scale=0.95), UNKNOWN)
+    assert "moved by 0.20 to usual steps" in shorter
+    assert "moved" not in describe(replace(guess, measured_scale=1.0), UNKNOWN)
 
 
 def test_the_tone_mapper_starts_there_and_is_held_from_the_first_step(measured: Response) -> None:
