@@ -10,17 +10,22 @@ import torch
 from pretend_device import pretend_device
 from test_adapt import sliding
 from test_features import random_state
-from tiny_networks import random_lightglue, tiny_depth_anything, tiny_dinov2, tiny_sam2
+from tiny_networks import (
+    random_flow_network,
+    random_lightglue,
+    tiny_depth_anything,
+    tiny_dinov2,
+    tiny_sam2,
+)
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.prepare.prepare import prepare
 from hdr_nsff.prepare.steps.neural import load_network
 from hdr_nsff.prepare.work import PrepareConfig
 from hdr_nsff.priors.depth.depth_anything import network_disparity
+from hdr_nsff.priors.flow import networks
 from hdr_nsff.priors.flow.adapt import Refiner
 from hdr_nsff.priors.flow.features import FeatureName, FeatureTuning
-from hdr_nsff.priors.flow.gmflow import GMFlow
-from hdr_nsff.priors.flow.networks import predict_both_directions
 from hdr_nsff.priors.flow.semantic import (
     SemanticConfig,
     SemanticFlow,
@@ -67,13 +72,17 @@ def test_features_their_fit_and_the_search_run_on_the_device(
     np.testing.assert_allclose(found, expected, atol=1e-3)
 
 
-def test_a_flow_network_runs_on_the_device() -> None:
-    torch.manual_seed(0)
-    network = GMFlow(channels=16, blocks=2).eval().requires_grad_(False)
+@pytest.mark.parametrize("name", ["gmflow", "raft"])
+def test_a_flow_network_is_loaded_onto_the_device_and_runs_there(
+    name: networks.Network, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    weights = random_flow_network(name, tmp_path, monkeypatch)
     a, b = noise(2, 48, 64, 3)
-    expected = predict_both_directions(network, a, b)
+    expected = networks.predict_both_directions(networks.load_network(name, weights), a, b)
     with pretend_device() as device:
-        found = predict_both_directions(network.to(device), a, b)
+        network = networks.load_network(name, weights, device)
+        assert {p.device for p in network.parameters()} == {device}
+        found = networks.predict_both_directions(network, a, b)
     np.testing.assert_allclose(found, expected, atol=1e-3)
 
 

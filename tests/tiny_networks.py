@@ -10,7 +10,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch import Tensor, nn
 
+from hdr_nsff.priors.flow import networks
+from hdr_nsff.priors.flow.gmflow import GMFlow
 from hdr_nsff.priors.weights import KNOWN
 
 
@@ -134,3 +137,26 @@ def random_lightglue(
         monkeypatch.setitem(KNOWN, name, replace(KNOWN[name], sha256=sha256))
     monkeypatch.setenv("HDR_NSFF_WEIGHTS", str(folder))
     return dict(glue)
+
+
+class TinyRaft(nn.Module):
+    """A stand-in for torchvision's RAFT: one layer that sees both images."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer = nn.Conv2d(6, 2, 3, padding=1)
+
+    def forward(self, first: Tensor, second: Tensor) -> list[Tensor]:
+        return [self.layer(torch.cat([first, second], 1))]
+
+
+def random_flow_network(
+    name: networks.Network, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> Path:
+    """Random weights of a tiny flow network of float32, which `load_network` builds."""
+    monkeypatch.setattr(networks, "GMFlow", lambda bf16: GMFlow(channels=16, blocks=2))
+    monkeypatch.setattr("hdr_nsff.priors.flow.raft.torchvision_raft", TinyRaft)
+    torch.manual_seed(0)
+    path = folder / f"{name}.pth"
+    torch.save(networks.build(name, torch.device("cpu")).state_dict(), path)
+    return path
