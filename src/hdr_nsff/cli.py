@@ -122,7 +122,7 @@ PRESET_HELP = {
     "splat": "4D Gaussians: minutes on a CPU; the default of `run`.",
     "grid": "A scene flow field on additive grids: minutes on a CPU.",
     "paper": "The published network, losses and schedules: 250,000 steps, for a GPU.",
-    "paper-small": "The same, small enough for 40 minutes on two CPU cores at 120x68.",
+    "paper-small": "The same, small enough for 42 minutes on a CPU core with bfloat16 at 120x68.",
     "tiny": "Seconds on a CPU, to try things out.",
     "nsff": "Baseline: NSFF, which knows one exposure, on the grids of `grid`.",
     "nsff-paper": "Baseline: NSFF at its published size, for a GPU.",
