@@ -19,6 +19,7 @@ from test_export_gaussians import make_run
 
 from hdr_nsff.core.checkpoints import pack, save_checkpoint
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.rendering import row_bands
 from hdr_nsff.rendering.served_run import ServedRun
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.build import tone_mapper_for
@@ -60,12 +61,19 @@ def request_of(toy: Scene, **change: object) -> FrameRequest:
     return replace(request, **change)  # type: ignore[arg-type]
 
 
+def frame(served: ServedRun, request: FrameRequest) -> bytes:
+    """The frame that somebody waits for."""
+    found = served.frame(request, lambda: True)
+    assert found is not None
+    return found
+
+
 def decode(jpeg: bytes) -> np.ndarray:
     bgr = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
     return bgr[..., ::-1] / 255
 
 
-@pytest.mark.parametrize("preset", ["splat", "grid"])
+@pytest.mark.parametrize("preset", ["splat", "grid", "paper"])
 def test_a_frame_is_what_the_camera_would_record(
     toy: Scene, toy_folder: Path, tmp_path: Path, preset: str
 ) -> None:
@@ -74,10 +82,10 @@ def test_a_frame_is_what_the_camera_would_record(
     camera = toy.train[0].camera
     radiance = run.field.render(camera, 1.0, scene_flow=False).radiance
     expected = run.tonemapper.develop(radiance, 0.0).view(camera.height, camera.width, 3)
-    found = decode(served.frame(request_of(toy)))
+    found = decode(frame(served, request_of(toy)))
     assert np.abs(found - expected.numpy()).mean() < 0.06  # noise, as a JPEG
     for change in ({"curve": "clip"}, {"curve": "reinhard"}, {"show": "depth"}, {"show": "motion"}):
-        assert decode(served.frame(request_of(toy, **change))).shape == found.shape
+        assert decode(frame(served, request_of(toy, **change))).shape == found.shape
 
 
 @pytest.mark.parametrize("preset", ["hdr-hexplane", "nerf-wt"])
@@ -86,17 +94,30 @@ def test_fields_that_record_by_themselves_are_served(
 ) -> None:
     save_run(toy, toy_folder, tmp_path / "run", preset)
     served = ServedRun(tmp_path / "run", "cpu")
-    found = decode(served.frame(request_of(toy, ev=-1.0)))
+    found = decode(frame(served, request_of(toy, ev=-1.0)))
     assert found.shape == (toy.train[0].camera.height, toy.train[0].camera.width, 3)
+
+
+def test_a_frame_is_given_up_between_two_bands(
+    toy: Scene, toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_run(toy, toy_folder, tmp_path / "run", "grid")
+    served = ServedRun(tmp_path / "run", "cpu")
+    whole = decode(frame(served, request_of(toy)))
+    monkeypatch.setattr(row_bands, "BAND_PIXELS", 5 * toy.train[0].camera.width + 1)
+    np.testing.assert_array_equal(decode(frame(served, request_of(toy))), whole)
+    answers = iter([True, True, False])
+    assert served.frame(request_of(toy), lambda: next(answers)) is None
+    assert next(answers, None) is None  # asked no more
 
 
 def test_requests_beyond_the_clip_are_refused(toy: Scene, toy_folder: Path, tmp_path: Path) -> None:
     save_run(toy, toy_folder, tmp_path / "run")
     served = ServedRun(tmp_path / "run", "cpu")
     with pytest.raises(InputError, match="outside the clip"):
-        served.frame(request_of(toy, time=99.0))
+        frame(served, request_of(toy, time=99.0))
     with pytest.raises(InputError, match="camera 3 is not known"):
-        served.frame(request_of(toy, camera_id=3))
+        frame(served, request_of(toy, camera_id=3))
 
 
 def test_the_newest_checkpoint_is_opened_again(

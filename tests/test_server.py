@@ -5,7 +5,8 @@ from __future__ import annotations
 import http.client
 import json
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -24,6 +25,7 @@ REQUEST = {
     "camera": 0,
     "show": "radiance",
 }
+SLOW = 3.0  # the time of a frame that is rendered as long as it is awaited
 
 
 class Fake:
@@ -31,6 +33,7 @@ class Fake:
 
     def __init__(self, folder: Path) -> None:
         self.video = folder / "b.mp4"
+        self.given_up = threading.Event()  # a frame that was not awaited any more
 
     def page(self) -> str:
         return "<p>page</p>"
@@ -44,15 +47,25 @@ class Fake:
     def videos(self) -> dict[str, Path]:
         return {"/video/a.mp4": self.video}
 
-    def frame(self, request: FrameRequest) -> bytes:
+    def frame(self, request: FrameRequest, awaited: Callable[[], bool]) -> bytes | None:
         if request.time > 4:
             raise InputError("outside the clip")
+        if request.time == SLOW:
+            while awaited():
+                time.sleep(0.01)
+            self.given_up.set()
+            return None
         return f"{request.width} x {request.height}".encode()
 
 
 @pytest.fixture
-def port(tmp_path: Path) -> Iterator[int]:
-    with ViewerServer(Fake(tmp_path)) as server:
+def fake(tmp_path: Path) -> Fake:
+    return Fake(tmp_path)
+
+
+@pytest.fixture
+def port(fake: Fake) -> Iterator[int]:
+    with ViewerServer(fake) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield server.server_port
         server.shutdown()
@@ -78,6 +91,14 @@ def test_page_scene_version_and_frames_are_served(port: int) -> None:
 def test_a_frame_that_cannot_be_rendered_is_a_sentence(port: int) -> None:
     answer = ask(port, "POST", "/frame", json.dumps({**REQUEST, "time": 9}))
     assert answer == (400, b"outside the clip")
+
+
+def test_a_frame_ends_with_its_connection(port: int, fake: Fake) -> None:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+    connection.request("POST", "/frame", json.dumps({**REQUEST, "time": SLOW}))
+    assert not fake.given_up.wait(0.2)
+    connection.close()
+    assert fake.given_up.wait(20)
 
 
 def test_other_names_for_this_machine_are_refused(port: int) -> None:

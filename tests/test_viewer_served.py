@@ -5,9 +5,12 @@ Chromium.
 
 from __future__ import annotations
 
+import json
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from queue import Queue
 
 import numpy as np
 import pytest
@@ -18,7 +21,9 @@ from viewer_tab import state
 
 from hdr_nsff.rendering.served_run import ServedRun
 from hdr_nsff.scene.scene import Scene
-from hdr_nsff.viewer.server import MAX_PIXELS, ViewerServer
+from hdr_nsff.viewer.server import MAX_PIXELS, FrameRequest, ViewerServer
+
+SENT = "Network.requestWillBeSent"
 
 if find_browser() is None:
     pytest.skip("no Chromium", allow_module_level=True)
@@ -36,10 +41,18 @@ def address(
         server.shutdown()
 
 
+def asked_widths(tab: Page) -> list[int]:
+    """The widths of the frames that the page has asked for."""
+    asked = [e["params"]["request"] for e in tab.events if e["method"] == SENT]
+    return [json.loads(r["postData"])["width"] for r in asked if r["url"].endswith("/frame")]
+
+
 @pytest.mark.parametrize("address", ["splat", "grid"], indirect=True)
 def test_a_browser_without_a_gpu_shows_frames_of_the_server(tab: Page, address: str) -> None:
     tab.goto(address, 500, 300)
-    tab.wait("!document.getElementById('frame').hidden")
+    tab.wait("!viewer.frames.busy && viewer.frames.shown > 0")
+    first, *_, last = asked_widths(tab)
+    assert first < last == tab.run("viewer.scene.width")
     tab.press("ArrowRight")
     tab.drag((120, 100), (160, 110))
     tab.press("v")
@@ -66,6 +79,45 @@ def test_frames_of_the_server_are_never_too_large(tab: Page, address: str) -> No
     assert tab.run("JSON.parse(document.getElementById('settings').textContent).max_pixels") == (
         MAX_PIXELS
     )
+
+
+class SlowRun(ServedRun):
+    """A run whose finest frames take as long as they are awaited, once it is slow."""
+
+    slow = False
+
+    def __init__(self, folder: Path, device: str) -> None:
+        super().__init__(folder, device)
+        self.given_up: Queue[float] = Queue()  # the times of such frames
+
+    def frame(self, request: FrameRequest, awaited: Callable[[], bool]) -> bytes | None:
+        finest = request.width == self.run.scene.train[0].camera.width
+        if not (self.slow and finest):
+            return super().frame(request, awaited)
+        while awaited():
+            time.sleep(0.01)
+        self.given_up.put(request.time)
+        return None
+
+
+def test_the_newest_view_waits_for_no_finer_frame_of_another(
+    tab: Page, toy: Scene, toy_folder: Path, tmp_path: Path
+) -> None:
+    save_run(toy, toy_folder, tmp_path / "run")
+    source = SlowRun(tmp_path / "run", "cpu")
+    with ViewerServer(source) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        tab.goto(server.address, 500, 300)
+        tab.wait("!viewer.frames.busy && viewer.frames.shown > 0")
+        tab.run("Object.defineProperty(viewer.frames, 'rate', {get: () => 0, set() {}})")
+        source.slow = True
+        for _ in range(3):
+            tab.run("globalThis.before = viewer.frames.shown")
+            tab.press("ArrowRight")
+            tab.wait("viewer.frames.shown > before && viewer.frames.refining")
+        assert [source.given_up.get(timeout=20) for _ in range(2)] == [1, 2]
+        assert tab.problems() == []
+        server.shutdown()
 
 
 def test_a_browser_that_draws_too_slowly_asks_the_server(tab: Page, address: str) -> None:

@@ -6,6 +6,7 @@ While the run is still training, its newest checkpoint is opened again.
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +21,9 @@ from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.maths import color
 from hdr_nsff.rendering.develop import develop_view
 from hdr_nsff.rendering.export_page import HDR_CLIP, VIDEOS, find_hdr_clip, run_scene
+from hdr_nsff.rendering.row_bands import render_in_bands
 from hdr_nsff.rendering.shot_views import check_views
-from hdr_nsff.rendering.stills import Still, render_still
+from hdr_nsff.rendering.stills import Still
 from hdr_nsff.training.run_folder import Run
 from hdr_nsff.viewer.field_scene import jpeg
 from hdr_nsff.viewer.page_file import Link, PageSettings, make_page
@@ -86,12 +88,12 @@ class ServedRun:
                     say(f"{self.folder}: {error}")
             return self.opened
 
-    def frame(self, request: FrameRequest) -> bytes:
+    def frame(self, request: FrameRequest, awaited: Callable[[], bool]) -> bytes | None:
         with self.lock:
             view = self.view_of(request)
             check_views(self.run, "frame", [view])
-            still = render_still(self.run, view, "direct", motion=False)
-            return jpeg(self.picture(request, view, still))
+            still = render_in_bands(self.run, view, False, awaited)
+            return None if still is None else jpeg(self.picture(request, view, still))
 
     def view_of(self, request: FrameRequest) -> PathView:
         """The view that a request asks for."""

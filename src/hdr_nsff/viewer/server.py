@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import json
 import re
+import select
+import socket
+from collections.abc import Callable
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -63,8 +66,11 @@ class Source(Protocol):
         """MP4 files by their addresses, which begin with a slash."""
         ...
 
-    def frame(self, request: FrameRequest) -> bytes:
-        """A rendered frame as a JPEG file. InputError where it cannot be rendered."""
+    def frame(self, request: FrameRequest, awaited: Callable[[], bool]) -> bytes | None:
+        """A rendered frame as a JPEG file. InputError where it cannot be rendered.
+
+        None where the frame is not `awaited` any more.
+        """
         ...
 
 
@@ -117,11 +123,21 @@ class Handler(BaseHTTPRequestHandler):
         length = int(self.headers.get("Content-Length") or 0)
         try:
             request = parse_request(self.rfile.read(min(length, MAX_REQUEST_BYTES)))
-            frame = self.server.source.frame(request)
+            frame = self.server.source.frame(request, self.is_awaited)
         except InputError as error:
             self.answer(HTTPStatus.BAD_REQUEST, "text/plain; charset=utf-8", str(error).encode())
-        else:
+            return
+        if frame is not None:
             self.answer(HTTPStatus.OK, "image/jpeg", frame)
+
+    def is_awaited(self) -> bool:
+        """Whether the browser still waits: else it has closed the connection."""
+        if not select.select([self.connection], [], [], 0)[0]:
+            return True
+        try:
+            return self.connection.recv(1, socket.MSG_PEEK) != b""
+        except ConnectionError:
+            return False
 
     def answer_video(self, path: Path) -> None:
         """Send an MP4 file, or the part of it that a player asks for."""
