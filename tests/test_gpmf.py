@@ -35,26 +35,28 @@ def track(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
 
 
 def test_exposures_are_time_times_sensitivity(track: list[bytes]) -> None:
-    ev = gpmf.read_gopro_ev(Path("clip.mp4"), 4)
-    assert ev is not None
-    np.testing.assert_allclose(ev - ev[0], [0, -1, -1, 1], atol=1e-6)
+    found = gpmf.read_gopro(Path("clip.mp4"), 4)
+    assert found is not None
+    np.testing.assert_allclose(found.ev - found.ev[0], [0, -1, -1, 1], atol=1e-6)
+    np.testing.assert_allclose(1 / found.seconds, [100, 200, 400, 50], rtol=1e-6)
 
 
 def test_a_last_frame_without_exposure_takes_the_one_before(track: list[bytes]) -> None:
-    ev = gpmf.read_gopro_ev(Path("clip.mp4"), 5)
-    assert ev is not None and ev.shape == (5,) and ev[4] == ev[3]
+    found = gpmf.read_gopro(Path("clip.mp4"), 5)
+    assert found is not None
+    assert found.ev.shape == (5,) and found.ev[4] == found.ev[3]
 
 
 def test_exposures_of_other_frames_are_not_taken(track: list[bytes]) -> None:
-    assert gpmf.read_gopro_ev(Path("clip.mp4"), 8) is None
+    assert gpmf.read_gopro(Path("clip.mp4"), 8) is None
     track[:] = [packet([], [])]
-    assert gpmf.read_gopro_ev(Path("clip.mp4"), 4) is None
+    assert gpmf.read_gopro(Path("clip.mp4"), 4) is None
 
 
 @pytest.mark.parametrize("seconds", [np.nan, np.inf, 0.0])
 def test_impossible_exposures_are_not_taken(track: list[bytes], seconds: float) -> None:
     track[:] = [packet([0.01, seconds, 0.01, 0.01], [100] * 4)]
-    assert gpmf.read_gopro_ev(Path("clip.mp4"), 4) is None
+    assert gpmf.read_gopro(Path("clip.mp4"), 4) is None
 
 
 def test_entries_are_read_to_a_depth_that_cameras_write() -> None:
@@ -73,4 +75,4 @@ def test_damaged_tracks_end_and_do_not_raise(noise: bytes, cut: int) -> None:
 
 def test_a_video_without_the_track_has_none(tmp_path: Path) -> None:
     (tmp_path / "clip.mp4").write_bytes(b"no video")
-    assert gpmf.read_gopro_ev(tmp_path / "clip.mp4", 3) is None
+    assert gpmf.read_gopro(tmp_path / "clip.mp4", 3) is None

@@ -186,7 +186,10 @@ def test_the_shutter_reaches_the_field_that_has_one(tmp_path: Path) -> None:
     assert isinstance(field, SplatConfig) and (field.readout, field.shutter) == (20.0, 0.5)
     with pytest.raises(InputError, match="--preset splat"):
         train_settings(replace(config, preset="grid"))
-    with pytest.raises(InputError, match="shutter"):
+    assert check_config(train_settings(replace(config, shutter="auto"))).field == replace(
+        field, shutter="auto"
+    )
+    with pytest.raises(InputError, match=r"--field\.shutter 3\.0: choose a number up to 1"):
         check_config(train_settings(replace(config, shutter=3.0)))
 
 

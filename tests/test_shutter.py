@@ -1,21 +1,29 @@
 """Rolling shutters and motion blur against renders at the time of each row."""
 
 import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
 
 import pytest
 import torch
+from bad_input import Capture, refused, training
 from test_splat import BESIDE, CAMERA, STEP, batch_of, card_field
 from torch import Tensor
 
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.fields.build import timing_of
 from hdr_nsff.fields.splat import training_view
 from hdr_nsff.fields.splat.shutter import (
     MAX_RENDERS,
     Shutter,
+    Timing,
     apparent_motion,
     open_times,
     row_times,
     shutter_for,
 )
+from hdr_nsff.scene.scene import Scene
 
 TIME = 4
 
@@ -42,7 +50,7 @@ def test_every_row_is_of_its_own_time() -> None:
 
 
 def test_blur_is_the_mean_over_the_time_of_the_open_shutter() -> None:
-    blurred = trained_picture(Shutter(open=(0.8,)))
+    blurred = trained_picture(Shutter(open=(0.8,) * (TIME + 1)))
     moments = [TIME + 0.8 * ((k + 0.5) / 40 - 0.5) for k in range(40)]
     exact = torch.stack([picture(t) for t in moments]).mean(0)
     assert (blurred - exact).abs().mean() < 0.25 * (picture(TIME) - exact).abs().mean()
@@ -51,7 +59,7 @@ def test_blur_is_the_mean_over_the_time_of_the_open_shutter() -> None:
 def test_no_shutter_and_a_moment_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     by_kernels = trained_picture(None)  # which have no shutter
     monkeypatch.setattr(training_view, "cloud_maker", lambda model, view: None)
-    moment = trained_picture(Shutter(0.0, (0.0,)))
+    moment = trained_picture(Shutter(0.0, (0.0,) * (TIME + 1)))
     assert torch.equal(trained_picture(None), moment)
     torch.testing.assert_close(by_kernels, moment)
 
@@ -81,7 +89,66 @@ def test_as_many_renders_as_pixels_of_blur() -> None:
     assert open_times(CAMERA, points, motion, 0.0) == [0.0]
 
 
+def timing(exposures: list[float], seconds: float | None = None, **known: Any) -> Timing:
+    """Of frames at these exposures in stops, the longest exposed for `seconds`."""
+    times = [None if seconds is None else seconds * 2 ** (ev - max(exposures)) for ev in exposures]
+    numbers: dict[str, Any] = {"fps": 25.0, "stride": 1, "frame_seconds": None, **known}
+    return Timing(exposure_times=tuple(times), exposures=tuple(exposures), **numbers)
+
+
 def test_exposures_shorten_the_shutter_and_nothing_is_nothing() -> None:
-    assert shutter_for(0.0, 0.0, 24.0, [0.0, -2.0]) is None
-    shutter = shutter_for(20.0, 0.5, 25.0, [-2.0, 0.0, -4.0])
+    assert shutter_for(0.0, 0.0, timing([0.0, -2.0])) is None
+    shutter = shutter_for(20.0, 0.5, timing([-2.0, 0.0, -4.0]))
     assert shutter == Shutter(0.5, (0.125, 0.5, 0.03125))
+
+
+def test_the_shutter_follows_times_and_not_the_gain() -> None:
+    alternating_iso = replace(timing([0.0, 2.0]), exposure_times=(0.01, 0.01))
+    shutter = shutter_for(0.0, 0.5, alternating_iso)
+    assert shutter is not None and shutter.open == (0.5, 0.5)
+
+
+def test_exposure_times_say_for_how_long_the_shutter_is_open() -> None:
+    shutter = shutter_for(0.0, "auto", timing([0.0, -1.0], seconds=0.02, frame_seconds=0.04))
+    assert shutter is not None and shutter.open == pytest.approx((0.5, 0.25))
+
+
+@pytest.mark.parametrize("share", [0.5, "auto"])
+def test_a_frame_of_every_second_one_is_twice_as_long(share: float | Literal["auto"]) -> None:
+    every = timing([0.0], seconds=0.02, frame_seconds=0.04)
+    second = replace(every, stride=2, fps=12.5)
+    one, two = shutter_for(10.0, share, every), shutter_for(10.0, share, second)
+    assert one == Shutter(0.25, (0.5,)) and two == Shutter(0.125, (0.25,))
+
+
+@pytest.mark.parametrize(
+    ("known", "problem"),
+    [
+        (timing([0.0, -2.0], frame_seconds=0.04), "no exposure times"),
+        (timing([0.0, -2.0], seconds=0.02), "nothing shows the time from frame to frame"),
+        (timing([0.0], seconds=0.05, frame_seconds=0.04), "0.05 s, which is longer than the 0.04"),
+    ],
+)
+def test_times_that_are_unknown_or_impossible_are_refused(known: Timing, problem: str) -> None:
+    with pytest.raises(InputError, match=problem):
+        shutter_for(0.0, "auto", known)
+
+
+def test_a_shutter_that_the_scene_does_not_know_is_refused_before_a_run_begins(
+    toy_folder: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    command = [*training(toy_folder, tmp_path / "run", 1), "--shutter", "auto"]
+    assert "--shutter auto: the scene has no exposure times" in refused(capsys, *command)
+    assert not list((tmp_path / "run").glob("*"))
+
+
+def test_a_scene_says_when_its_frames_were_taken(toy: Scene) -> None:
+    frames = toy.manifest.frames
+    entries = [f.model_copy(update={"exposure_time": 0.001 * (f.index + 1)}) for f in frames]
+    manifest = toy.manifest.model_copy(update={"frames": entries, "stride": 3})
+    drifting = [replace(f, drift=0.5) for f in toy.train]
+    found = timing_of(replace(toy, manifest=manifest, train=drifting))
+    assert found.stride == 3 and found.fps == toy.manifest.fps
+    assert found.exposure_times == tuple(0.001 * (f.index + 1) for f in toy.train)
+    ev = [float(toy.response.ev[f.bracket]) + 0.5 for f in toy.train]
+    assert found.exposures == pytest.approx(tuple(ev))

@@ -23,7 +23,7 @@ from hdr_nsff.core.video import (
     video_info,
     write_video,
 )
-from hdr_nsff.footage.gpmf import read_gopro_ev
+from hdr_nsff.footage.gpmf import read_gopro
 
 FRAMES = [np.full((17, 33, 3), level) for level in (0.1, 0.5, 0.9)]
 
@@ -99,7 +99,7 @@ def test_a_title_in_another_encoding_is_no_damage(tmp_path: Path) -> None:
     assert video_info(tmp_path / "a.avi").frames == 3
     assert len(list(read_video(tmp_path / "a.avi"))) == 3
     assert len(frame_times(tmp_path / "a.avi")) == 3
-    assert read_gopro_ev(tmp_path / "a.avi", 3) is None
+    assert read_gopro(tmp_path / "a.avi", 3) is None
 
 
 def shown(path: Path, frame: np.ndarray, aspect: Fraction) -> np.ndarray:

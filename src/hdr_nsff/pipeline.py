@@ -62,8 +62,10 @@ class RunConfig(PrepareConfig):
     """Training time instead of the preset's; of each segment or part."""
     readout: float = 0.0
     """Milliseconds from a rolling shutter's first row to its last (`splat`)."""
-    shutter: float = 0.0
-    """Motion blur: share of a frame's time that the brightest exposure takes (`splat`).
+    shutter: float | Literal["auto"] = 0.0
+    """Motion blur (`splat`): share of the time from frame to frame of the clip for
+    which the longest exposure takes light; auto: as the exposure times say, where a
+    list, EXIF or a GoPro has them.
     """
     refine_poses: bool = False
     """Correct the training cameras (poses and focal length) a little, by the picture.

@@ -69,7 +69,9 @@ def explain(error: ErrorDetails, command: str) -> str:
     names = [str(part) for part in error["loc"]]
     types = {"splat", "nsff", "nerf-wt", "hdr-hexplane", "grids", "network"}
     # `budget` is written out into flags of its own
-    flags = [name.replace("_", "-") for name in names if name not in types | {"budget"}]
+    # nor are the kinds of number that a setting may be, besides a word
+    unnamed = types | {"budget", "constrained-float"}
+    flags = [name.replace("_", "-") for name in names if name not in unnamed]
     option = "--" + ".".join(flags) if flags else "the settings"
     shown = repr(error["input"])
     if len(shown) > MAX_SHOWN:

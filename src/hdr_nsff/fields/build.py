@@ -21,7 +21,7 @@ from hdr_nsff.fields.splat import cuda_backends
 from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.initialize_gaussians import initialize_gaussians
 from hdr_nsff.fields.splat.initialize_local import count_local_pixels, limit_rigid_movers
-from hdr_nsff.fields.splat.shutter import shutter_for
+from hdr_nsff.fields.splat.shutter import Timing, shutter_for
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.scene.scene import Scene
 
@@ -48,6 +48,12 @@ def device_for(config: FieldConfig, name: str) -> torch.device:
     raise InputError(f"--device {name}: {reason}, or use --device cpu")
 
 
+def check_scene(config: FieldConfig, scene: Scene) -> None:
+    """InputError where a field needs to know more of a scene than this one says."""
+    if isinstance(config, SplatConfig):
+        shutter_for(config.readout, config.shutter, timing_of(scene))
+
+
 def build_field(config: FieldConfig, scene: Scene) -> AnyField:
     """An untrained field for a scene."""
     m, near, far = scene.manifest, scene.near, scene.far
@@ -55,7 +61,7 @@ def build_field(config: FieldConfig, scene: Scene) -> AnyField:
         local_pixels = count_local_pixels(limit_rigid_movers(scene, config.bases))
         if config.moving is None and not any(mover.rigid for mover in scene.movers):
             config = replace(config, moving=0)  # there is nothing for them to draw
-        shutter = shutter_for(config.readout, config.shutter, m.fps, scene.response.ev.tolist())
+        shutter = shutter_for(config.readout, config.shutter, timing_of(scene))
         num_pixels = m.width * m.height
         return Splat(config, scene.times, near, far, num_pixels, local_pixels, shutter)
     space = build_space([f.camera for f in scene.train], near, far)
@@ -77,6 +83,19 @@ def build_field(config: FieldConfig, scene: Scene) -> AnyField:
             assert_never(config)
     field.allow_motion(scene.train)
     return field
+
+
+def timing_of(scene: Scene) -> Timing:
+    """When the training frames of a scene were taken, and for how long."""
+    m = scene.manifest
+    seconds = {entry.index: entry.exposure_time for entry in m.frames}
+    return Timing(
+        fps=m.fps,
+        stride=m.stride,
+        frame_seconds=m.frame_seconds,
+        exposure_times=tuple(seconds.get(f.index) for f in scene.train),
+        exposures=tuple(float(scene.response.ev[f.bracket]) + f.drift for f in scene.train),
+    )
 
 
 def initialize_field(

@@ -12,8 +12,9 @@ import io
 import logging
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from hdr_nsff.core.errors import InputError, check_number, shorten
 from hdr_nsff.footage.footage import Footage
@@ -24,6 +25,7 @@ LIST = "exposures.csv"  # in a folder of frames
 TIMES = {"exposure": 1.0, "exposure_s": 1.0, "exposure_us": 1e-6, "exposure_ns": 1e-9}
 GAINS = ("iso", "gain_db", "aperture")  # count where a time is given
 DB_PER_STOP = 20 * math.log10(2)
+T = TypeVar("T")
 EXAMPLE = "write times like 1/250 and EV like -2"
 
 
@@ -78,6 +80,14 @@ def log2_seconds(text: str, where: str) -> float:
 # CSV
 
 
+@dataclass(frozen=True)
+class Listed:
+    """The exposure of a frame in a CSV."""
+
+    ev: float  # log2 of light times gain
+    seconds: float | None  # the exposure time, where the CSV has one
+
+
 def read_exposure_csv(footage: Footage) -> tuple[Path, dict[str, float]] | None:
     """The CSV beside the frames and its EV by frame; None where there is none.
 
@@ -85,6 +95,15 @@ def read_exposure_csv(footage: Footage) -> tuple[Path, dict[str, float]] | None:
     and `ev` or a time (`TIMES`), with those of `GAINS`. InputError that names the line
     of what is not understood.
     """
+    table = read_listed(footage)
+    if table is None:
+        return None
+    path, rows = table
+    return path, {key: row.ev for key, row in rows.items()}
+
+
+def read_listed(footage: Footage) -> tuple[Path, dict[str, Listed]] | None:
+    """The same, with exposure times."""
     path = csv_path(footage)
     if not path.is_file():
         refuse_scattered(footage)
@@ -92,7 +111,7 @@ def read_exposure_csv(footage: Footage) -> tuple[Path, dict[str, float]] | None:
     reader = csv.DictReader(io.StringIO(read_utf8(path), newline=""), skipinitialspace=True)
     try:
         name, values = find_columns(path, reader.fieldnames or [])
-        rows: dict[str, float] = {}
+        rows: dict[str, Listed] = {}
         for row in reader:
             where = f"{path}, line {reader.line_num}"
             check_cells(row, (name, *values), where)
@@ -104,7 +123,8 @@ def read_exposure_csv(footage: Footage) -> tuple[Path, dict[str, float]] | None:
                 raise InputError(
                     f"{where}: {ev:.0f} EV is beyond all light (at most {MAX_EV:g}); correct it"
                 )
-            if rows.setdefault(key, ev) != ev:
+            listed = Listed(ev, seconds_of_cell(values[0], row[values[0]], where))
+            if rows.setdefault(key, listed).ev != ev:
                 raise InputError(
                     f"{where}: a second exposure of {shorten(row[name])}; give each frame one, "
                     "and with several cameras the folder before the name, as in left/0001.png"
@@ -142,13 +162,18 @@ def ev_in_list(
     """The EV of a frame in the `rows` of a CSV, by its name `source` or `number`; by
     its `whole_name`, with the folder, only, where several tracks have the others.
     """
+    ev = row_of(rows, source, number, whole_name)
+    if ev is not None:
+        return ev
+    raise InputError(f"{path}: no row for frame {source}; add it, or give `--exposures auto`")
+
+
+def row_of(rows: Mapping[str, T], source: str, number: int, whole_name: bool = False) -> T | None:
+    """The row of a frame by its name or number, as of `ev_in_list`; None without."""
     keys = [source]
     if not whole_name:
         keys += [Path(source).name, f"#{number}"]
-    for key in keys:
-        if key in rows:
-            return rows[key]
-    raise InputError(f"{path}: no row for frame {source}; add it, or give `--exposures auto`")
+    return next((rows[key] for key in keys if key in rows), None)
 
 
 def read_utf8(path: Path) -> str:
@@ -180,6 +205,11 @@ def ev_of_cell(column: str, text: str, where: str) -> float:
     if column == "iso":
         return math.log2(value / 100)
     return -2 * math.log2(value)  # f-number
+
+
+def seconds_of_cell(column: str, text: str, where: str) -> float | None:
+    """The exposure time in a cell; None where its column has none."""
+    return parse_number(text, where) * TIMES[column] if column in TIMES else None
 
 
 def find_columns(path: Path, columns: Sequence[str]) -> tuple[str, list[str]]:
@@ -221,20 +251,31 @@ def read_exif_ev(path: Path) -> float | None:
 
     None where it has no exposure time, or is damaged.
     """
+    tags = read_exif(path)
+    seconds = exif_number(tags, "ExposureTime") or 0.0
+    iso = exif_number(tags, "ISOSpeedRatings") or 100.0
+    aperture = exif_number(tags, "FNumber") or 1.0
+    exposure = seconds * iso / 100 / aperture**2
+    return math.log2(exposure) if 0 < exposure < math.inf else None
+
+
+def read_exif_seconds(path: Path) -> float | None:
+    """The exposure time in the same tags; None without one above 0."""
+    seconds = exif_number(read_exif(path), "ExposureTime") or 0.0
+    return seconds if 0 < seconds < math.inf else None
+
+
+def read_exif(path: Path) -> Mapping[str, Any]:
+    """The tags of a file's EXIF; none where it is damaged."""
     import exifread
 
     # it warns of every picture without EXIF
     logging.getLogger("exifread").setLevel(logging.ERROR)
     try:
         with open(path, "rb") as file:
-            tags = exifread.process_file(file, details=False)
+            return exifread.process_file(file, details=False)
     except Exception:  # many unrelated types, for damaged EXIF
-        return None
-    seconds = exif_number(tags, "ExposureTime") or 0.0
-    iso = exif_number(tags, "ISOSpeedRatings") or 100.0
-    aperture = exif_number(tags, "FNumber") or 1.0
-    exposure = seconds * iso / 100 / aperture**2
-    return math.log2(exposure) if 0 < exposure < math.inf else None
+        return {}
 
 
 def exif_number(tags: Mapping[str, Any], name: str) -> float | None:

@@ -9,6 +9,7 @@ in seconds, `ISOE` the sensor's sensitivity, both once a frame.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,8 +24,21 @@ MAX_MISSING_SHARE = 0.02
 MAX_DEPTH = 16  # of entries in entries: cameras write four
 
 
-def read_gopro_ev(path: Path, num_frames: int) -> np.ndarray | None:
-    """log2 of (exposure time x ISO / 100) of every frame of a video (num_frames,).
+@dataclass(frozen=True)
+class GoProFrames:
+    """What a GoPro wrote of every frame of a video."""
+
+    seconds: np.ndarray  # (T,) exposure time
+    iso: np.ndarray  # (T,) of the sensor
+
+    @property
+    def ev(self) -> np.ndarray:
+        """log2 of (exposure time x ISO / 100), (T,)."""
+        return np.log2(self.seconds) + np.log2(self.iso / 100)
+
+
+def read_gopro(path: Path, num_frames: int) -> GoProFrames | None:
+    """What a GoPro wrote of the `num_frames` frames of a video.
 
     None where the video has no such track, or one that does not fit its frames.
     """
@@ -42,8 +56,13 @@ def read_gopro_ev(path: Path, num_frames: int) -> np.ndarray | None:
         iso = [100.0] * len(seconds)
     if abs(len(seconds) - num_frames) > max(1, MAX_MISSING_SHARE * num_frames):
         return None
-    ev = np.log2(seconds) + np.log2(np.array(iso) / 100)
-    return np.pad(ev, (0, max(0, num_frames - len(ev))), mode="edge")[:num_frames]
+    return GoProFrames(per_frame(seconds, num_frames), per_frame(iso, num_frames))
+
+
+def per_frame(values: list[float], num_frames: int) -> np.ndarray:
+    """Written values for `num_frames` frames: the last one stays, surplus ones go."""
+    missing = max(0, num_frames - len(values))
+    return np.pad(np.array(values), (0, missing), mode="edge")[:num_frames]
 
 
 def metadata_packets(path: Path) -> Iterator[bytes]:

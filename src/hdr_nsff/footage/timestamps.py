@@ -52,11 +52,11 @@ def read_timestamps(footage: Footage) -> dict[str, float]:
     return seconds
 
 
-def frame_gaps(seconds: Sequence[float | None], stride: int = 1) -> np.ndarray | None:
-    """By how many used frames each of the used ones follows the one before (T-1,): 1,
-    or more where frames are missing; None where timestamps do not show it.
+def usual_gap(seconds: Sequence[float | None], stride: int = 1) -> float | None:
+    """Seconds from one frame of the footage to the next, of those that are not longer
+    because frames are missing; None where timestamps do not show it.
 
-    `stride`: every how manyth frame of the footage is used.
+    `stride`: every how manyth frame of the footage has its `seconds`.
     """
     if len(seconds) < 3 or any(s is None for s in seconds):
         return None
@@ -64,8 +64,20 @@ def frame_gaps(seconds: Sequence[float | None], stride: int = 1) -> np.ndarray |
     median = float(np.median(gaps))
     if not median > 0 or gaps.min() <= 0:
         return None
-    usual = float(gaps[gaps < (1 + MIN_EXTRA) * median].mean())  # finer: times are rounded
-    frames = gaps / usual * stride
+    # finer than the median: times are rounded
+    return float(gaps[gaps < (1 + MIN_EXTRA / stride) * median].mean()) / stride
+
+
+def frame_gaps(seconds: Sequence[float | None], stride: int = 1) -> np.ndarray | None:
+    """By how many used frames each of the used ones follows the one before (T-1,): 1,
+    or more where frames are missing; None where timestamps do not show it.
+
+    `stride`: every how manyth frame of the footage is used.
+    """
+    usual = usual_gap(seconds, stride)
+    if usual is None:
+        return None
+    frames = np.diff(np.array(seconds, np.float64)) / usual
     longer = frames - stride > MIN_EXTRA
     if longer.mean() > MAX_SHARE:
         return None

@@ -21,7 +21,7 @@ from hdr_nsff.footage.exposure_lists import (
     read_exif_ev,
     read_exposure_csv,
 )
-from hdr_nsff.footage.gpmf import read_gopro_ev
+from hdr_nsff.footage.gpmf import read_gopro
 from hdr_nsff.footage.ingest import read_frames
 from hdr_nsff.prepare.times import by_timestamps, evenly_spaced
 from hdr_nsff.prepare.work import Work
@@ -255,9 +255,9 @@ def gopro_exposures(work: Work) -> list[float]:
     known: list[float] = []
     numbers = work.frame_numbers()
     for own, files in zip(work.camera_frames(), work.footage.cameras, strict=True):
-        written = read_gopro_ev(files[0], work.footage.count or 0)
+        written = read_gopro(files[0], work.footage.count or 0)
         if written is not None:
-            known += [float(written[numbers[i]]) for i in own]
+            known += [float(written.ev[numbers[i]]) for i in own]
     return known
 
 

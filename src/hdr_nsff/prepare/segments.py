@@ -42,6 +42,8 @@ MIN_FRAMES = 12
 OF_CLIP: tuple[StepName, ...] = ("frames", "exposure", "flow", "poses")
 BEFORE_RESPONSE: tuple[StepName, ...] = ("masks", "static_depth")
 AFTER_RESPONSE: tuple[StepName, ...] = ("refined_flow", "movers", "depth", "sheet")
+# of the manifest, that the step `frames` sets
+FRAME_VALUES = ("width", "height", "fps", "stride", "frame_seconds")
 Take = Callable[[Work, Work], StepResult]  # of the whole clip, for a segment
 
 
@@ -200,7 +202,7 @@ def take_frames(clip: Work, work: Work) -> StepResult:
         entries.append(entry.model_copy(update={"camera_id": f.camera_id, "track": f.track}))
     if [identity(f, False) for f in m.frames] != [identity(f, False) for f in entries]:
         m.frames = entries  # else the results of later steps for these frames stay
-    sizes = {name: getattr(clip.manifest, name) for name in ("width", "height", "fps")}
+    sizes = {name: getattr(clip.manifest, name) for name in FRAME_VALUES}
     return StepResult(note="", manifest=sizes, files=files)
 
 
@@ -210,7 +212,7 @@ def take_exposure(clip: Work, work: Work) -> StepResult:
     own = own_frames(clip, work)
     frames: dict[str, dict[int, Any]] = {
         name: {index: getattr(f, name) for index, f in enumerate(own)}
-        for name in ("time", "bracket", "ev", "split")
+        for name in ("time", "bracket", "ev", "split", "exposure_time")
     }
     given = clip.manifest.steps["exposure"].details.get("drift_given", False)
     frames["drift"] = {index: f.drift for index, f in enumerate(own)} if given else {}

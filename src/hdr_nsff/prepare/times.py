@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hdr_nsff.footage.timestamps import frame_gaps, read_timestamps
+from hdr_nsff.footage.timestamps import frame_gaps, read_timestamps, usual_gap
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.scene.manifest import FrameEntry
 
@@ -37,6 +37,20 @@ def leave_gaps(work: Work, entries: list[FrameEntry], seconds: list[float | None
         for k, time in zip(line, times.tolist(), strict=True):
             entries[k].time = round(time, 6)
     return round(float((first - 1).sum() * stride))
+
+
+def frame_seconds(work: Work, entries: list[FrameEntry]) -> float | None:
+    """Seconds from one frame of the footage to the next, by timestamps or the rate of a
+    video; None where nothing shows them.
+    """
+    if work.capture is not None:
+        return None
+    written = read_timestamps(work.footage)
+    if written:
+        first = [e for e in entries if (e.camera_id, e.track) == (0, 0)]
+        seconds = [seconds_of(work, entry, written) for entry in first]
+        return usual_gap(seconds, work.config.stride)
+    return 1 / work.footage.fps if work.footage.video else None
 
 
 def seconds_of(work: Work, entry: FrameEntry, written: dict[str, float]) -> float | None:

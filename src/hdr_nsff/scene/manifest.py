@@ -84,6 +84,8 @@ class FrameEntry(Strict):
     ev: float | None = None  # log2 exposure relative to the reference bracket, if known
     # stops by which it differs from its bracket's (auto exposure), None: not at all
     drift: float | None = None
+    # seconds for which the shutter was open, None where unknown
+    exposure_time: float | None = Field(default=None, gt=0, le=1e6)
     # stops (3,) by which its white balance differs from the clip's, None: not at all
     white_balance: list[float] | None = None
     split: Split = "train"
@@ -137,6 +139,9 @@ class Manifest(Strict):
     height: int = Field(gt=0)
     protocol: Protocol | None = None  # how the clip was split for `evaluate`
     fps: float = Field(default=24.0, gt=0, le=1e6)
+    stride: int = Field(default=1, ge=1)  # every how manyth frame of the footage is used
+    # seconds from one frame of the footage to the next, None where no clock shows them
+    frame_seconds: float | None = Field(default=None, gt=0, le=1e6)
     cycle: int = Field(default=1, ge=1)  # length of the exposure cycle
     # still cameras of one make that took the frames in turn, 1: no rig
     rig: int = Field(default=1, ge=1)

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from annotated_types import Ge, Le
 from tyro.conf import arg
 
-from hdr_nsff.core.settings import Advanced, Count, Number, Rate, Weight
+from hdr_nsff.core.settings import Advanced, Count, Number, Rate, Share, Weight
 
 # default number of Gaussians, per pixel of a frame and at most (hand-chosen on rendered
 # scenes, for minutes of training on a CPU)
@@ -81,8 +81,11 @@ class SplatConfig:
     """Unbounded radiance, or one below 1."""
     readout: Annotated[float, Ge(0), Le(1000), arg(aliases=("--readout",))] = 0.0
     """Milliseconds from a rolling shutter's first row to its last."""
-    shutter: Annotated[float, Ge(0), Le(1), arg(aliases=("--shutter",))] = 0.0
-    """Motion blur: share of a frame's time that the brightest exposure takes."""
+    shutter: Annotated[Share | Literal["auto"], arg(aliases=("--shutter",))] = 0.0
+    """Motion blur: share of the time from frame to frame of the clip for which the
+    longest exposure takes light; auto: as the exposure times say, where a list, EXIF or
+    a GoPro has them.
+    """
     relocate_every: Advanced[Number] = 200
     """Steps after which unseen Gaussians are moved to where the picture is wrong (0:
     never).

@@ -14,10 +14,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
 
+from hdr_nsff.core.errors import InputError
 from hdr_nsff.geometry.cameras import Camera
 
 MAX_RENDERS = 5  # of one blurred frame
@@ -31,7 +33,7 @@ class Shutter:
     readout: float = 0.0
     """From the first row to the last, in frames."""
     open: tuple[float, ...] = ()
-    """Per bracket, in frames; empty: a moment."""
+    """Per training frame, in frames; empty: a moment."""
 
     def expose(
         self,
@@ -39,12 +41,13 @@ class Shutter:
         camera: Camera,
         means: Tensor,
         motion: Tensor,
-        bracket: int,
+        frame: int,
     ) -> list[Tensor]:
-        """The mean of what is drawn of points that move from `means` (G, 3) by `motion`
-        (G, 3) scene units a frame; `draw` gets them as they are at one time.
+        """The mean of what training frame `frame` shows of points that move from
+        `means` (G, 3) by `motion` (G, 3) scene units a frame; `draw` gets them as they
+        are at one time.
         """
-        open_for = self.open[bracket] if self.open else 0.0
+        open_for = self.open[frame] if self.open else 0.0
         rows = row_times(camera, means, self.readout)
         times = open_times(camera, means, motion, open_for)
         total: list[Tensor] = []
@@ -54,17 +57,66 @@ class Shutter:
         return [map_ / len(times) for map_ in total]
 
 
-def shutter_for(readout_ms: float, share: float, fps: float, ev: list[float]) -> Shutter | None:
-    """The shutter of a clip of `fps` frames a second, None where it changes nothing.
+Share = float | Literal["auto"]
 
-    It is open for a `share` of the frames' interval at the brightest of the exposures
-    `ev` (log2), and for less at the others in proportion.
+
+@dataclass(frozen=True)
+class Timing:
+    """What a scene knows of when its T training frames were taken. A frame of the scene
+    is one of those used, every `stride`th of the footage.
+    """
+
+    fps: float  # frames a second, of those used
+    stride: int
+    frame_seconds: float | None  # from one frame of the footage to the next, if known
+    exposure_times: tuple[float | None, ...]  # (T,) seconds, None where unknown
+    exposures: tuple[float, ...]  # (T,) log2, to any reference
+
+
+def shutter_for(readout_ms: float, share: Share, timing: Timing) -> Shutter | None:
+    """The shutter of a clip, None where it changes nothing.
+
+    It is open for a `share` of the time from frame to frame of the footage where it is
+    open longest. Other frames follow in proportion to their exposure times, or, where
+    these are not known for all frames, to their exposures. "auto": for the exposure
+    times; InputError where they or the time from frame to frame are unknown.
     """
     if not readout_ms and not share:
         return None
-    brightest = max(ev)
-    times = tuple(share * 2.0 ** (e - brightest) for e in ev) if share else ()
-    return Shutter(readout_ms * 1e-3 * fps, times)
+    shares: tuple[float, ...] = ()
+    if share == "auto":
+        shares = known_shares(timing)
+    elif share:
+        shares = tuple(share * time for time in relative_times(timing))
+    open_for = tuple(own / timing.stride for own in shares)
+    return Shutter(readout_ms * 1e-3 * timing.fps, open_for)
+
+
+def known_shares(timing: Timing) -> tuple[float, ...]:
+    """For which share of the time from frame to frame each frame was exposed."""
+    known = [seconds for seconds in timing.exposure_times if seconds is not None]
+    advice = "give a share of the time from frame to frame, such as 0.5"
+    if len(known) < len(timing.exposure_times):
+        raise InputError(f"--shutter auto: the scene has no exposure times of all frames; {advice}")
+    if timing.frame_seconds is None:
+        raise InputError(
+            "--shutter auto: nothing shows the time from frame to frame, neither a video nor "
+            f"`timestamp_ns`; {advice}"
+        )
+    if max(known) > timing.frame_seconds:
+        raise InputError(
+            f"--shutter auto: a frame was exposed for {max(known):.4g} s, which is longer than the "
+            f"{timing.frame_seconds:.4g} s from frame to frame; {advice}"
+        )
+    return tuple(seconds / timing.frame_seconds for seconds in known)
+
+
+def relative_times(timing: Timing) -> list[float]:
+    """Exposure times (T,) relative to the longest; by exposures where unknown."""
+    known = [seconds for seconds in timing.exposure_times if seconds is not None]
+    if len(known) < len(timing.exposure_times):
+        known = [2.0**ev for ev in timing.exposures]
+    return [seconds / max(known) for seconds in known]
 
 
 @torch.no_grad()

@@ -170,7 +170,7 @@ def expose(
         points = positions_at(model, knot, living).detach()
         neighbors.append((batch.neighbors[offset], points, model.time(knot)))
     motion = apparent_motion(batch.camera, neighbors, cloud.means, batch.time)
-    return Maps(*shutter.expose(draw_at, batch.camera, cloud.means, motion, batch.bracket))
+    return Maps(*shutter.expose(draw_at, batch.camera, cloud.means, motion, batch.frame))
 
 
 def flow_to_neighbor(

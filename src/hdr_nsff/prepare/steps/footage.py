@@ -16,11 +16,12 @@ from hdr_nsff.footage.frame_choice import check_frame_size
 from hdr_nsff.footage.hold_out import HOLD_OUT, frames_between, hold_out_every
 from hdr_nsff.footage.ingest import read_frames
 from hdr_nsff.footage.turns import find_cameras_in_turn
+from hdr_nsff.prepare.exposure_times import exposure_times
 from hdr_nsff.prepare.exposures import frame_exposures
 from hdr_nsff.prepare.length import offered_segments
 from hdr_nsff.prepare.lens import describe, undistorted
 from hdr_nsff.prepare.result import StepResult
-from hdr_nsff.prepare.times import leave_gaps, times_of_slots
+from hdr_nsff.prepare.times import frame_seconds, leave_gaps, times_of_slots
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.radiometry import exposure_cycle as exposure
 from hdr_nsff.scene.manifest import FrameEntry, Protocol, bracket_problem
@@ -64,8 +65,10 @@ def frames_step(work: Work) -> StepResult:
     check_frames(c.clip, entries, extents)
     if work.footage.video:
         check_lengths(c.clip, entries)
+    m.frame_seconds = frame_seconds(work, entries)
     missing = leave_gaps(work, entries, seconds)
     m.fps = work.footage.fps / c.stride
+    m.stride = c.stride
     with_time = work.capture is not None  # of other footage, it may have gaps by the cycle
     if [identity(f, with_time) for f in m.frames] != [identity(f, with_time) for f in entries]:
         m.frames = entries  # else the results of later steps for these frames stay
@@ -178,6 +181,8 @@ def exposure_step(work: Work) -> StepResult:
         check_protocol(m.protocol, found.brackets, held_out)
     for frame, time in zip(m.frames, times_of_slots(work, found.slots), strict=True):
         frame.time = time
+    for frame, seconds in zip(m.frames, exposure_times(work, found), strict=True):
+        frame.exposure_time = seconds
     for frame, bracket in zip(m.frames, found.brackets, strict=True):
         frame.bracket = bracket
         frame.ev = m.bracket_ev[bracket]
