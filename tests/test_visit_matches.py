@@ -1,11 +1,21 @@
 """Keypoints and matches of a rig's cameras, merged from all of their visits."""
 
-import numpy as np
+from pathlib import Path
 
+import numpy as np
+import pytest
+import torch
+from posed_clips import BOARDS, FOCAL, H, W, sliding
+
+from hdr_nsff.priors.poses import sfm, visit_matches
+from hdr_nsff.priors.poses.lightglue import LightGlueTuning
+from hdr_nsff.priors.poses.matching import MatchingTuning
 from hdr_nsff.priors.poses.view_matches import ViewMatches
 from hdr_nsff.priors.poses.visit_matches import (
+    VisitImages,
     VisitTuning,
     choose_visits,
+    match_visits,
     merge_points,
     merge_visits,
     most_frequent,
@@ -55,3 +65,58 @@ def test_large_rigs_match_fewer_frames_per_camera():
     places = [t % 40 for t in range(80)]
     visits = choose_visits(video, ignore, video[:40], ignore[:40], places, VisitTuning())
     assert len(visits.camera) == 80  # the static picture and one frame each
+
+
+BASELINE = 0.2  # between two cameras side by side, scene units
+TOP = 20  # rows of every frame that are ignored
+HALF = W // 2
+
+
+def two_cameras() -> VisitImages:
+    """Two cameras that take turns twice. A mover hides the left half of every first
+    visit and the right half of every second one; nothing is known of static pictures.
+    """
+    places = [0, 1, 0, 1]
+    eyes = np.array([[-BASELINE / 2, 0, 0], [BASELINE / 2, 0, 0]])
+    video = sliding(eyes[places])
+    ignore = np.zeros((4, H, W), bool)
+    ignore[:, :TOP] = True
+    ignore[:2, :, :HALF] = True
+    ignore[2:, :, HALF:] = True
+    return choose_visits(video, ignore, video[:2], np.ones((2, H, W), bool), places)
+
+
+def exact(images, masks, pairs, matcher, tuning, device):
+    """A grid of points on the far wall, each the same row in every image."""
+    assert (images[0].shape, len(masks)) == ((2 * H, 2 * W, 3), 6)
+    x, y = np.meshgrid(np.arange(30.0, 2 * W - 30, 8), np.arange(4.0, 2 * H, 8))
+    here = np.stack([x.ravel(), y.ravel()], 1)
+    there = here - [2 * FOCAL * BASELINE / BOARDS[0][0], 0]
+    points = [there if camera else here for camera in two_cameras().camera]
+    return points, [np.repeat(np.arange(len(here))[:, None], 2, 1) for _ in pairs]
+
+
+@pytest.mark.parametrize("matcher", ["sift", "aliked"])
+def test_visits_see_what_movers_hide_in_others(
+    matcher: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Frames are doubled, so the cameras' shift is twice that of pixels."""
+    if matcher == "sift":
+        pytest.importorskip("pycolmap")
+    monkeypatch.setattr(visit_matches, "match_images", exact)
+    job = sfm.Job(str(tmp_path), [["0.png"], ["1.png"]], [], 2 * FOCAL, "match")
+    tunings = MatchingTuning(), LightGlueTuning(), VisitTuning()
+    found = match_visits(job, two_cameras(), True, matcher, torch.device("cpu"), *tunings)
+    assert found.pairs == [(0, 1)]
+    rows = found.matches[0]
+    assert len(np.unique(rows[:, 0])) == len(np.unique(rows[:, 1])) == len(rows)
+    a, b = (points[rows[:, side]] for side, points in enumerate(found.keypoints))
+    depths = [board[0] for board in BOARDS]
+    shifts = [2 * FOCAL * BASELINE / depth for depth in (max(depths), min(depths))]
+    assert (np.abs(a[:, 1] - b[:, 1]) < 1.5).mean() > 0.95
+    right = (a - b)[:, 0]
+    assert ((right > shifts[0] - 1.5) & (right < shifts[1] + 1.5)).mean() > 0.95
+    for points in (a, b):
+        assert points[:, 1].min() > 2 * TOP
+        left = points[:, 0] < 2 * HALF
+        assert left.sum() > 20 and (~left).sum() > 20
