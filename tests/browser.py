@@ -103,6 +103,15 @@ class Page:
         if self.run("document.body.dataset.ready") != "yes":
             raise RuntimeError(self.run("document.getElementById('loading').textContent"))
 
+    @contextmanager
+    def prepared(self, script: str) -> Iterator[None]:
+        """Pages that are loaded meanwhile run a script before their own."""
+        added = self.call("Page.addScriptToEvaluateOnNewDocument", source=script)
+        try:
+            yield
+        finally:
+            self.call("Page.removeScriptToEvaluateOnNewDocument", **added)
+
     def resize(self, width: int, height: int, mobile: bool = False) -> None:
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": mobile}
         self.call("Emulation.setDeviceMetricsOverride", **size)

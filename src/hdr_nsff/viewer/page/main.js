@@ -43,8 +43,7 @@ async function start() {
   const loop = (now) => {
     player.tick(now);
     if (player.state.stats) showStats(player);
-    if (player.renderer && settings.server && player.isSlow()) showFrames(player, settings);
-    else if (player.renderer) player.easeOff();
+    if (player.renderer) helpSlowDrawing(player, settings);
     requestAnimationFrame(loop);
   };
   requestAnimationFrame(loop);
@@ -66,13 +65,25 @@ async function draw(player, settings) {
     );
     if (player.renderer.readsHalves()) player.hdr = await openHdrScreen(find("hdr"));
     if (player.hdr) offerExtended(player);
-    if (!software) return;
-    const videos = settings.videos.length ? " The videos below the settings play smoothly." : "";
-    note(`This browser draws without a GPU, so playback is slow.${videos}`, 8);
+    if (software)
+      note(`This browser draws without a GPU, so playback is slow.${videoAdvice(settings)}`, 8);
+    player.advised = software;
   } catch (error) {
-    if (!settings.server) throw error;
+    if (!settings.server) throw new Error(error.message + videoAdvice(settings));
     showFrames(player, settings);
   }
+}
+
+/** Where drawing is slow: fewer pixels, frames of the server, or the videos. */
+function helpSlowDrawing(player, settings) {
+  if (settings.server && player.isSlow()) return showFrames(player, settings);
+  if (player.easeOff() || player.advised || !player.isSlow()) return;
+  note(`This browser draws slowly here.${videoAdvice(settings)}`, 8);
+  player.advised = true;
+}
+
+function videoAdvice({ videos }) {
+  return videos.length ? " The videos below the settings play smoothly." : "";
 }
 
 function shaderSources() {

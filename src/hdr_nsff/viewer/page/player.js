@@ -61,6 +61,7 @@ export class Player {
     };
     this.state.ev = clamp(this.state.ev, -MAX_EV, MAX_EV);
     this.maxRatio = MAX_PIXEL_RATIO; // less where drawing is slow
+    this.advised = false; // whether a slow browser has been told of the videos
     this.frameTimes = [];
     this.gap = 0; // milliseconds between the last two turns of the loop
     this.dirty = true;
@@ -179,13 +180,17 @@ export class Player {
     return shown;
   }
 
-  /** Draw fewer pixels from now on where drawing is not smooth, down to the clip's. */
+  /**
+   * Draw fewer pixels from now on where drawing is not smooth, down to the clip's; whether
+   * that was done.
+   */
   easeOff() {
     const { canvas, scene } = this;
-    if (!this.isBelow(SMOOTH_FRAMES_PER_SECOND) || canvas.width <= scene.width) return;
+    if (!this.isBelow(SMOOTH_FRAMES_PER_SECOND) || canvas.width <= scene.width) return false;
     this.maxRatio = Math.min(this.maxRatio, devicePixelRatio || 1) / 2;
     this.frameTimes = [];
     this.fit(...this.room);
+    return true;
   }
 
   /** One turn of the loop, at `now` in milliseconds. */
