@@ -74,7 +74,8 @@ HALF = W // 2
 
 def two_cameras() -> VisitImages:
     """Two cameras that take turns twice. A mover hides the left half of every first
-    visit and the right half of every second one; nothing is known of static pictures.
+    visit and the right half of every second one. Of the static pictures, the left half
+    of the second camera's is known alone.
     """
     places = [0, 1, 0, 1]
     eyes = np.array([[-BASELINE / 2, 0, 0], [BASELINE / 2, 0, 0]])
@@ -83,7 +84,9 @@ def two_cameras() -> VisitImages:
     ignore[:, :TOP] = True
     ignore[:2, :, :HALF] = True
     ignore[2:, :, HALF:] = True
-    return choose_visits(video, ignore, video[:2], np.ones((2, H, W), bool), places)
+    hidden = np.ones((2, H, W), bool)
+    hidden[1, TOP:, :HALF] = False
+    return choose_visits(video, ignore, video[:2], hidden, places)
 
 
 def exact(images, masks, pairs, matcher, tuning, device):
