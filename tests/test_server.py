@@ -80,6 +80,15 @@ def ask(port: int, method: str, path: str, body: str = "", host: str = "") -> tu
     return result
 
 
+def post(port: int, body: str, headers: dict[str, str]) -> int:
+    """The status of the answer to a frame's request."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+    connection.request("POST", "/frame", body, headers)
+    status = connection.getresponse().status
+    connection.close()
+    return status
+
+
 def test_page_scene_version_and_frames_are_served(port: int) -> None:
     assert ask(port, "GET", "/") == (200, b"<p>page</p>")
     assert ask(port, "GET", "/scene.hdr4d") == (200, b"scene")
@@ -107,6 +116,21 @@ def test_other_names_for_this_machine_are_refused(port: int) -> None:
     assert ask(port, "GET", "/version", host=f"localhost:{port}")[0] == 200
 
 
+@pytest.mark.parametrize(
+    ("origin", "status"),
+    [("http://127.0.0.1:{}", 200), ("http://evil.example", 403), ("null", 403)],
+)
+def test_pages_of_other_sites_get_no_frames(port: int, origin: str, status: int) -> None:
+    headers = {"Origin": origin.format(port)}
+    assert post(port, json.dumps(REQUEST), headers) == status
+
+
+@pytest.mark.parametrize("length", ["abc", "-1", "10001", "9" * 5000, "1.5", ""])
+def test_a_request_of_no_sensible_length_is_refused(port: int, length: str) -> None:
+    assert post(port, "", {"Content-Length": length}) == 400
+    assert ask(port, "GET", "/version") == (200, b"7")
+
+
 def test_a_port_that_is_taken_is_one_sentence(port: int, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not free"):
         ViewerServer(Fake(tmp_path), port)
@@ -120,6 +144,9 @@ def test_a_port_that_is_taken_is_one_sentence(port: int, tmp_path: Path) -> None
         ("bytes=4-6", 206, b"456", "bytes 4-6/10"),
         ("bytes=8-99", 206, b"89", "bytes 8-9/10"),
         ("bytes=-5", 200, b"0123456789", None),
+        ("bytes=5-3", 200, b"0123456789", None),
+        ("bytes=10-", 416, b"", "bytes */10"),
+        ("bytes=15-20", 416, b"", "bytes */10"),
     ],
 )
 def test_videos_are_served_whole_or_in_part(
@@ -132,7 +159,7 @@ def test_videos_are_served_whole_or_in_part(
     answer = connection.getresponse()
     assert (answer.status, answer.read()) == (status, body)
     assert answer.getheader("Content-Range") == part
-    assert answer.getheader("Content-Type") == "video/mp4"
+    assert (answer.getheader("Content-Type") == "video/mp4") == (status != 416)
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,8 @@ NUM_PORTS = 2**16
 MAX_EV = 60.0  # stops: beyond this float32 radiance is 0 or Inf
 CURVES = ("camera", "reinhard", "clip")  # that this machine develops frames with
 VIEWS = ("radiance", "depth", "motion")  # that it renders
-RANGE = re.compile(r"bytes=(\d+)-(\d*)")  # of a file, as players ask for it
+LENGTH = re.compile(r"\d{1,9}")  # of a request in bytes
+RANGE = re.compile(r"bytes=(\d{1,18})-(\d{0,18})")  # of a file, as players ask for it
 
 
 @dataclass(frozen=True)
@@ -117,18 +118,24 @@ class Handler(BaseHTTPRequestHandler):
                 self.answer(HTTPStatus.NOT_FOUND, "text/plain", b"nothing here")
 
     def do_POST(self) -> None:
-        if not self.is_local() or self.path != "/frame":
+        if not (self.is_local() and self.is_own_page()) or self.path != "/frame":
             self.answer(HTTPStatus.FORBIDDEN, "text/plain", b"not from this machine")
             return
-        length = int(self.headers.get("Content-Length") or 0)
         try:
-            request = parse_request(self.rfile.read(min(length, MAX_REQUEST_BYTES)))
+            request = parse_request(self.read_body())
             frame = self.server.source.frame(request, self.is_awaited)
         except InputError as error:
             self.answer(HTTPStatus.BAD_REQUEST, "text/plain; charset=utf-8", str(error).encode())
             return
         if frame is not None:
             self.answer(HTTPStatus.OK, "image/jpeg", frame)
+
+    def read_body(self) -> bytes:
+        """What was sent. InputError where its length is not given, or too large."""
+        length = self.headers.get("Content-Length", "")
+        if not (LENGTH.fullmatch(length) and int(length) <= MAX_REQUEST_BYTES):
+            raise InputError(f"frame: Content-Length must be from 0 to {MAX_REQUEST_BYTES}")
+        return self.rfile.read(int(length))
 
     def is_awaited(self) -> bool:
         """Whether the browser still waits: else it has closed the connection."""
@@ -142,12 +149,15 @@ class Handler(BaseHTTPRequestHandler):
     def answer_video(self, path: Path) -> None:
         """Send an MP4 file, or the part of it that a player asks for."""
         data = path.read_bytes()
-        asked = RANGE.fullmatch(self.headers.get("Range", ""))
-        first = int(asked[1]) if asked else 0
-        if asked is None or first >= len(data):
+        asked = parse_range(self.headers.get("Range", ""), len(data))
+        if asked is None:
             self.answer(HTTPStatus.OK, "video/mp4", data, {"Accept-Ranges": "bytes"})
             return
-        last = min(int(asked[2] or len(data)), len(data) - 1)
+        first, last = asked
+        if first >= len(data):
+            whole = {"Content-Range": f"bytes */{len(data)}"}
+            self.answer(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, "text/plain", b"", whole)
+            return
         part = {"Content-Range": f"bytes {first}-{last}/{len(data)}", "Accept-Ranges": "bytes"}
         self.answer(HTTPStatus.PARTIAL_CONTENT, "video/mp4", data[first : last + 1], part)
 
@@ -158,6 +168,11 @@ class Handler(BaseHTTPRequestHandler):
         """
         port = self.server.server_port
         return self.headers.get("Host") in (f"{HOST}:{port}", f"localhost:{port}")
+
+    def is_own_page(self) -> bool:
+        """Whether our page asks, or no page at all; those of other sites may not."""
+        origin = self.headers.get("Origin")
+        return origin is None or origin == f"http://{self.headers.get('Host')}"
 
     def answer(
         self, status: HTTPStatus, kind: str, body: bytes, more: dict[str, str] | None = None
@@ -177,6 +192,19 @@ class Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: Any) -> None:
         """Nothing: requests are not of interest at the terminal."""
+
+
+def parse_range(text: str, length: int) -> tuple[int, int] | None:
+    """The first and the last byte that a `Range` asks for in a file of `length` bytes.
+
+    None where it asks for no part that is understood here: the whole file.
+    """
+    asked = RANGE.fullmatch(text)
+    if asked is None:
+        return None
+    first = int(asked[1])
+    last = int(asked[2]) if asked[2] else max(first, length - 1)
+    return None if last < first else (first, min(last, length - 1))
 
 
 def parse_request(data: bytes) -> FrameRequest:
