@@ -5,13 +5,15 @@ no Chromium.
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from browser import Page, find_browser
-from viewer_tab import state
+from viewer_scenes import scene_file
+from viewer_tab import open_page, state
 
 from hdr_nsff.geometry import paths
 from hdr_nsff.scene.scene import Scene
@@ -173,6 +175,17 @@ def test_buttons_work_by_pointer(viewer: Page) -> None:
     assert state(viewer, "mode") == "fly"
     viewer.click("#stats-button")
     viewer.wait("document.getElementById('stats').textContent.includes('Gaussians')")
+
+
+def test_the_button_of_a_bracket_rounds_its_label_alone(
+    tab: Page, toy: Scene, tmp_path: Path
+) -> None:
+    exposures = [2.04, -1.96, 0.0, 0.04]
+    open_page(tab, tmp_path / "scene.html", replace(scene_file(toy), exposures=exposures))
+    labels = tab.run("[...document.querySelectorAll('#brackets button')].map(b => b.textContent)")
+    assert labels == ["−2", "0", "+2"]
+    tab.click("#brackets button")
+    assert (state(tab, "curve"), state(tab, "ev")) == ("camera", -1.96)
 
 
 def test_the_copied_path_is_one_that_render_reads(viewer: Page, toy: Scene, tmp_path: Path) -> None:

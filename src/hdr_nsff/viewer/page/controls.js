@@ -93,13 +93,12 @@ function fillChoices(player) {
         find("curve").add(new Option(`${label} ${k}`, `camera ${k}`)),
       );
   }
-  const exposures = [...new Set(scene.exposures.map((ev) => Math.round(10 * ev) / 10))].sort(
-    (a, b) => a - b,
-  );
-  for (const ev of exposures) {
+  const exposures = [...scene.exposures].sort((a, b) => a - b);
+  const labeled = new Map(exposures.map((ev) => [stops(Math.round(10 * ev) / 10), ev]));
+  for (const [text, ev] of labeled) {
     const button = document.createElement("button");
     button.type = "button";
-    button.textContent = stops(ev);
+    button.textContent = text;
     button.title = "As this exposure of the clip was recorded";
     button.onclick = () => player.set({ ev, curve: "camera" });
     find("brackets").append(button);
