@@ -36,7 +36,10 @@ def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
 
 
 def test_training_can_be_watched(
-    toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    toy_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(module.subprocess, "Popen", FakeProcess)
     assert subprocess.Popen is FakeProcess
@@ -44,6 +47,16 @@ def test_training_can_be_watched(
     (command,) = FakeProcess.commands
     assert command[3:] == ["view", str(tmp_path / "run"), "--wait", "--device", "cpu"]
     assert FakeProcess.ended == 1
+    assert "opens it again" in capsys.readouterr().err
+
+
+def test_a_run_that_never_began_is_not_offered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(module.subprocess, "Popen", FakeProcess)
+    assert call(*training(tmp_path / "none", tmp_path / "run", 1), "--view") == 2
+    told = capsys.readouterr().err
+    assert "the viewer has closed" in told and "opens it again" not in told
 
 
 def test_other_verbs_have_no_such_option(tmp_path: Path) -> None:

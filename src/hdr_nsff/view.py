@@ -69,4 +69,5 @@ def viewer_beside(run: Path) -> Iterator[None]:
     finally:
         viewer.terminate()
         viewer.wait()
-        say(f"the viewer has closed; `hdr-nsff view {run}` opens it again")
+        again = f"; `hdr-nsff view {run}` opens it again" if newest_checkpoint(run) else ""
+        say(f"the viewer has closed{again}")
