@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -74,4 +75,13 @@ def test_pictures_too_small_for_an_encoder_are_refused_before_rendering(tmp_path
     before = run.field.calls
     with pytest.raises(InputError, match="48 x 32 pixels; an HDR encoder takes at least 64"):
         render_shot(run, large_shot(1.0), tmp_path / "out", Output(hdr_video=("pq",)))
+    assert run.field.calls == before and not (tmp_path / "out").exists()
+
+
+def test_a_rate_that_an_encoder_does_not_take_is_refused_before_rendering(tmp_path: Path) -> None:
+    run = fake_run(tmp_path)
+    before = run.field.calls
+    fast = replace(large_shot(), fps=480)
+    with pytest.raises(InputError, match="480 frames a second; AV1 has at most 240"):
+        render_shot(run, fast, tmp_path / "out", Output(hdr_video=("pq",), hdr_codec="av1"))
     assert run.field.calls == before and not (tmp_path / "out").exists()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,9 @@ from hdr_nsff.core.hdr_video import (
     Codec,
     LightLevels,
     Planes,
+    can_encode,
     check_encoder,
+    timed,
     write_hdr_video,
 )
 from hdr_nsff.maths.hdr_signal import Transfer, encode, ycbcr_planes
@@ -105,6 +108,32 @@ def test_light_levels_of_hdr10_are_read_back(tmp_path: Path, codec: Codec) -> No
     side_data = {data.type.name: bytes(data) for data in decoded(path)[1][0].side_data}
     assert struct.unpack("<II", side_data["CONTENT_LIGHT_LEVEL"]) == (812, 98)
     assert "MASTERING_DISPLAY_METADATA" in side_data
+
+
+def test_av1_above_240_frames_a_second_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+    for fps in (240.5, 480.0, 960.0, 1000.0):
+        with pytest.raises(InputError, match=f"{fps:g} frames a second; AV1 has at most 240"):
+            write_hdr_video(path, [ramp("hlg")], fps, "hlg", "av1")
+        assert not can_encode("av1", W, H, fps) and can_encode("hevc", W, H, fps)
+    write_hdr_video(path, [ramp("hlg")] * 2, 240_000 / 1001, "hlg", "av1")
+    assert decoded(path)[0].average_rate == Fraction(240_000, 1001)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_frames_of_short_and_fast_hevc_keep_their_times(tmp_path: Path, count: int) -> None:
+    path = tmp_path / "a.mp4"
+    write_hdr_video(path, [ramp("hlg")] * count, 960, "hlg", "hevc")
+    stream, frames = decoded(path)
+    assert [round(f.time * 960) for f in frames] == list(range(count))
+    assert stream.duration * stream.time_base == Fraction(count, 960)
+
+
+def test_times_of_decoding_that_x265_leaves_unset_are_filled_in() -> None:
+    unset, early = av.Packet(b""), av.Packet(b"")
+    unset.pts, unset.dts = 1, -144117387132666367  # as it was seen
+    early.pts, early.dts = 5, -2  # a frame that is decoded before it is shown
+    assert [packet.dts for packet in timed([unset, early])] == [1, -2]
 
 
 def test_what_cannot_be_written_is_refused(tmp_path: Path, monkeypatch: Any) -> None:

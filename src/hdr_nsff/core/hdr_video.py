@@ -37,6 +37,8 @@ HEVC_CRF = 14
 AV1_CRF = 18
 AV1_PRESET = 6  # of 0 (slow) to 13
 MIN_SIDE_PX = 64  # x265 4.2 overruns its buffers at widths of 48 and less
+MAX_AV1_FPS = 240  # of SVT-AV1
+MAX_DELAY = 1000  # frames: far more than an encoder ever waits for
 
 
 @dataclass(frozen=True)
@@ -59,11 +61,12 @@ def check_encoder(codec: Codec) -> None:
         raise InputError(f"HDR video: this PyAV has no encoder {encoder}; {advice}") from error
 
 
-def can_encode(codec: Codec, width: int, height: int) -> bool:
-    """Whether this PyAV writes HDR video of this size."""
+def can_encode(codec: Codec, width: int, height: int, fps: float) -> bool:
+    """Whether this PyAV writes HDR video of this size and rate."""
     try:
         check_encoder(codec)
         check_side("", width, height)
+        check_rate("", codec, fps)
     except InputError:
         return False
     return True
@@ -86,6 +89,7 @@ def write_hdr_video(
     import av
 
     check_encoder(codec)
+    check_rate(path, codec, fps)
     os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 prints banners otherwise
     count = 0
     with (
@@ -97,19 +101,18 @@ def write_hdr_video(
             if stream is None:
                 height, width = planes[0].shape
                 check_side(path, width, height)
-                rate = Fraction(fps).limit_denominator(1001)
                 options = encoder_options(codec, transfer, light, peak_nits)
-                stream = container.add_stream(ENCODERS[codec], rate=rate, options=options)
+                stream = container.add_stream(ENCODERS[codec], rate=rate_of(fps), options=options)
                 stream.width, stream.height = width, height
                 stream.pix_fmt = pixel_format(codec)
                 if codec == "hevc":  # Apple's players take no other tag
                     stream.codec_context.codec_tag = "hvc1"
                 tag_rec2020(stream.codec_context, transfer)
-            container.mux(stream.encode(to_frame(planes, transfer, pixel_format(codec))))
+            container.mux(timed(stream.encode(to_frame(planes, transfer, pixel_format(codec)))))
             count += 1
         if stream is None:
             raise InputError(f"{path}: no frames to write")
-        container.mux(stream.encode())
+        container.mux(timed(stream.encode()))
     return count
 
 
@@ -119,6 +122,29 @@ def check_side(path: Path | str, width: int, height: int) -> None:
         size = f"pictures of {width} x {height} pixels"
         limit = f"an HDR encoder takes at least {MIN_SIDE_PX} pixels a side; use larger ones"
         raise InputError(f"{path}: {size}; {limit}")
+
+
+def check_rate(path: Path | str, codec: Codec, fps: float) -> None:
+    """InputError for more frames a second than the encoder takes."""
+    if codec == "av1" and rate_of(fps) > MAX_AV1_FPS:
+        limit = f"AV1 has at most {MAX_AV1_FPS}; choose --hdr-codec hevc, or a lower rate"
+        raise InputError(f"{path}: {fps:g} frames a second; {limit}")
+
+
+def rate_of(fps: float) -> Fraction:
+    """Frames a second as encoders take them."""
+    return Fraction(fps).limit_denominator(1001)
+
+
+def timed(packets: list[Any]) -> list[Any]:
+    """Packets with the times at which they are decoded.
+
+    In videos of one or two frames, x265 leaves these unset: any number may be there.
+    """
+    for packet in packets:
+        if packet.dts < -MAX_DELAY:
+            packet.dts = packet.pts
+    return packets
 
 
 def has_full_chroma(codec: Codec) -> bool:

@@ -18,7 +18,7 @@ import torch
 
 from hdr_nsff.core import notes
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.hdr_video import check_side
+from hdr_nsff.core.hdr_video import check_rate, check_side
 from hdr_nsff.core.images import contact_sheet, read_image, write_png
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.core.video import write_video
@@ -47,7 +47,7 @@ def render_shot(run: Run, shot: Shot, out: Path, output: Output, of_set: bool = 
     if not 0 <= output.camera_id < cameras:
         problem = f"the run has learned cameras 0 to {cameras - 1}"
         raise InputError(f"camera {output.camera_id}: {problem}")
-    check_sides(out, shot, output)
+    check_encodable(out, shot, output)
     folder, video = out / shot.name, out / f"{shot.name}.mp4"
     sheet = out / f"{shot.name}_sheet.png"
     products = [video, sheet, *hdr_paths(out, shot.name)]
@@ -148,9 +148,11 @@ def numbered_pictures(folder: Path) -> list[Path]:
     return [p for p in folder.glob("[0-9]*") if p.suffix in endings]
 
 
-def check_sides(out: Path, shot: Shot, output: Output) -> None:
-    """InputError where the encoders of HDR files do not take pictures of this size."""
+def check_encodable(out: Path, shot: Shot, output: Output) -> None:
+    """InputError where the encoders of HDR files do not take this size or rate."""
     files = hdr_files(out, shot.name, output)
+    for path in files:
+        check_rate(path, output.hdr_codec, shot.fps)
     if "avif" in output.hdr_still:
         files.append(still_path(out / shot.name / "00000.png", "avif"))
     camera = shot.views[0].camera

@@ -97,7 +97,7 @@ def with_hdr_clip(output: Output, shot: Shot) -> Output:
     """The output with the HDR video for the viewer's page, if it can be encoded."""
     camera = shot.views[0].camera
     width, height = camera.width // 2 * 2, camera.height // 2 * 2
-    if output.hdr_video or not can_encode(output.hdr_codec, width, height):
+    if output.hdr_video or not can_encode(output.hdr_codec, width, height, shot.fps):
         return output
     return replace(output, hdr_video=("hlg",))
 
