@@ -8,6 +8,7 @@ another key starts over, and so does every step that builds on it.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import shutil
@@ -19,7 +20,7 @@ from typing import Any
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.hashes import hash_file
-from hdr_nsff.core.io import is_leftover
+from hdr_nsff.core.io import SCENE_FILE, is_leftover
 from hdr_nsff.core.process import cpu_seconds, peak_memory
 from hdr_nsff.core.progress import say
 from hdr_nsff.footage.datasets.capture import Picture
@@ -65,7 +66,11 @@ def run_step(work: Work, name: StepName, step: Step) -> None:
     records[name] = record.model_copy(update={"done": False})
     work.save()
     start, cpu_before = time.monotonic(), cpu_seconds()
-    result = step.run(work)
+    try:
+        result = step.run(work)
+    except InputError:
+        leave_nothing(work, step)
+        raise
     store(work.folder, work.manifest, result)
     records[name] = StepRecord(
         done=True,
@@ -81,6 +86,21 @@ def run_step(work: Work, name: StepName, step: Step) -> None:
     work.forget(step.forgets)
     if not step.quiet:
         say(f"{name}: {result.note}")
+
+
+def leave_nothing(work: Work, step: Step) -> None:
+    """Remove what the first step has written before it was refused, and the scene
+    folder where it holds nothing else.
+    """
+    if len(work.manifest.steps) > 1:
+        return
+    for output in step.outputs:
+        remove(work.folder / output)
+    if [path.name for path in work.folder.iterdir()] == [SCENE_FILE]:
+        remove(work.folder / SCENE_FILE)
+    for folder in work.made:
+        with contextlib.suppress(OSError):  # it holds other files
+            folder.rmdir()
 
 
 def next_attempt(record: StepRecord | None, key: str) -> StepRecord:

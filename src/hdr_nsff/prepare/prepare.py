@@ -31,6 +31,7 @@ from hdr_nsff.footage.footage import Footage, open_footage
 from hdr_nsff.footage.frame_choice import check_choice, no_frame
 from hdr_nsff.footage.ingest import FootageFrame, read_frames
 from hdr_nsff.footage.tracks import open_tracks
+from hdr_nsff.prepare.check_lists import check_lists
 from hdr_nsff.prepare.cut_parts import (
     known_parts,
     longest,
@@ -134,6 +135,7 @@ def begin(config: PrepareConfig) -> Work:
             "prepared as a whole; leave the option out"
         )
     footage = open_clip(config, capture)
+    check_lists(config, footage, capture)
     inputs = {name: hash_file(path) for name, path in track(footage.files.items(), "inputs")}
     found = found_manifest(config)
     if found is not None and found.inputs != inputs:
@@ -153,7 +155,8 @@ def begin(config: PrepareConfig) -> Work:
         return work
     height, width = first_frame(config, footage).rgb.shape[:2]
     manifest = Manifest(source=str(config.clip), inputs=inputs, width=width, height=height)
-    work = Work(config, footage, manifest, capture)
+    made = tuple(path for path in (config.out, *config.out.parents) if not path.exists())
+    work = Work(config, footage, manifest, capture, made=made)
     manifest.lens = given_lenses(work)
     work.save()
     return work

@@ -197,6 +197,7 @@ class Work:
     manifest: Manifest
     capture: Capture | None = None  # the training pictures of a public data set
     segment: Segment | None = None  # where the folder holds a part of the clip
+    made: tuple[Path, ...] = ()  # the folder, and those above it that were not there before
 
     @property
     def folder(self) -> Path:
