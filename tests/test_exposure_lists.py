@@ -20,6 +20,7 @@ from hdr_nsff.footage.exposure_lists import (
     read_exposure_csv,
 )
 from hdr_nsff.footage.footage import open_footage
+from hdr_nsff.footage.timestamps import read_timestamps
 
 GRAY = np.full((24, 32, 3), 0.5)
 
@@ -176,6 +177,14 @@ def test_lists_in_the_folders_of_cameras_are_not_passed_over(tmp_path):
     (tmp_path / "b/exposures.csv").write_text("file,ev\nf1.png,0\nf2.png,1\n")
     with pytest.raises(InputError, match=r"b/exposures.csv: .* one list for all cameras; join"):
         read_exposure_csv(open_footage(tmp_path))
+
+
+@pytest.mark.parametrize("read", [read_exposure_csv, read_timestamps])
+def test_a_folder_in_the_place_of_a_list_is_not_passed_over(tmp_path, read):
+    write_frames(tmp_path, 2)
+    (tmp_path / "exposures.csv").mkdir()
+    with pytest.raises(InputError, match=r"exposures\.csv: is no file, .*; rename it"):
+        read(open_footage(tmp_path))
 
 
 def test_a_frame_has_one_exposure(tmp_path):

@@ -104,8 +104,8 @@ def read_exposure_csv(footage: Footage) -> tuple[Path, dict[str, float]] | None:
 
 def read_listed(footage: Footage) -> tuple[Path, dict[str, Listed]] | None:
     """The same, with exposure times."""
-    path = csv_path(footage)
-    if not path.is_file():
+    path = find_csv(footage)
+    if path is None:
         refuse_scattered(footage)
         return None
     reader = csv.DictReader(io.StringIO(read_utf8(path), newline=""), skipinitialspace=True)
@@ -142,6 +142,14 @@ def csv_path(footage: Footage) -> Path:
     if footage.path.is_dir():
         return footage.path / LIST
     return footage.path.with_suffix(".csv")
+
+
+def find_csv(footage: Footage) -> Path | None:
+    """The CSV of a clip, None without one; InputError where that is no file."""
+    path = csv_path(footage)
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: is no file, where a list of exposures is read; rename it")
+    return path if path.is_file() else None
 
 
 def refuse_scattered(footage: Footage) -> None:

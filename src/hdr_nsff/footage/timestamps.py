@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.footage.exposure_lists import csv_path, parse_number, read_utf8
+from hdr_nsff.footage.exposure_lists import find_csv, parse_number, read_utf8
 from hdr_nsff.footage.footage import Footage
 
 COLUMN = "timestamp_ns"
@@ -28,8 +28,8 @@ def read_timestamps(footage: Footage) -> dict[str, float]:
     """Seconds of every frame in the column `timestamp_ns` of the CSV beside the frames,
     by file name or `#number`; empty without.
     """
-    path = csv_path(footage)
-    if not path.is_file():
+    path = find_csv(footage)
+    if path is None:
         return {}
     reader = csv.DictReader(io.StringIO(read_utf8(path), newline=""), skipinitialspace=True)
     seconds = {}
