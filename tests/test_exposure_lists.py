@@ -81,7 +81,8 @@ def test_a_csv_beside_a_video_names_frames_by_number(tmp_path):
     ("text", "what"),
     [
         ("file,ev\nf1.png,1/0\n", "line 2"),
-        ("file,exposure\nf1.png,1e-300\n", "line 2: -997 EV is beyond"),
+        ("file,exposure\nf1.png,1e-300\n", "line 2: -996.6 EV is beyond"),
+        ("file,ev\nf1.png,1e300\n", r"line 2: 1e\+300 EV is beyond all light \(at most 60\)"),
         ("name,value\n", "columns"),
         ("", "columns"),
         ("file;ev\nf1.png;1\n", "columns are file;ev"),

@@ -88,7 +88,7 @@ def test_exposures_beyond_all_light_are_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "clip").mkdir()
     (tmp_path / "clip/exposures.csv").write_text(f"file,exposure\n{rows}")
     work = work_on(tmp_path, clip([-2, 0, 2], frames=12))
-    with pytest.raises(InputError, match=r"exposures\.csv, line 3: -100 EV"):
+    with pytest.raises(InputError, match=r"exposures\.csv, line 3: -99.66 EV"):
         exposure_step(work)
 
 

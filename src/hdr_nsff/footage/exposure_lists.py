@@ -121,7 +121,7 @@ def read_listed(footage: Footage) -> tuple[Path, dict[str, Listed]] | None:
             ev = sum(ev_of_cell(column, row[column], where) for column in values)
             if abs(ev) > MAX_EV:
                 raise InputError(
-                    f"{where}: {ev:.0f} EV is beyond all light (at most {MAX_EV:g}); correct it"
+                    f"{where}: {ev:.4g} EV is beyond all light (at most {MAX_EV:g}); correct it"
                 )
             listed = Listed(ev, seconds_of_cell(values[0], row[values[0]], where))
             if rows.setdefault(key, listed).ev != ev:
