@@ -220,3 +220,18 @@ def test_another_tab_says_nothing_about_the_speed(viewer: Page) -> None:
     assert viewer.run(run.format(turns.format(1, 5000) + turns.format(4, 16))) is False
     assert viewer.run("viewer.frameTimes.length") == 5
     assert viewer.run(run.format(turns.format(8, 700))) is True  # a slow GPU always pauses
+
+
+def test_recorded_frames_of_a_scene_that_is_replaced_are_given_back(viewer: Page) -> None:
+    viewer.run("viewer.set({split: true}), viewer.set({time: 2})")
+    viewer.run(
+        "(real => { globalThis.given = [];"
+        "URL.revokeObjectURL = address => { given.push(address); real.call(URL, address); };"
+        "})(URL.revokeObjectURL)"
+    )
+    shown = viewer.run("viewer.scene.views.map(view => view.address).filter(Boolean)")
+    fresh = "viewer.scene.views.map(({address, ...view}) => view)"
+    viewer.run(f"viewer.replace({{...viewer.scene, views: {fresh}}})")
+    assert len(shown) == 2 and set(shown) <= set(viewer.run("given"))
+    recorded = viewer.run("document.getElementById('recorded').src")
+    assert recorded.startswith("blob:") and recorded not in shown

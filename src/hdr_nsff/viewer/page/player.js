@@ -139,6 +139,7 @@ export class Player {
 
   /** Show another state of the same scene: a run that is training. */
   async replace(scene) {
+    for (const { address } of this.scene.views) if (address) URL.revokeObjectURL(address);
     this.scene = scene;
     if (this.renderer) await this.renew(this.renderer, scene);
     this.set({});
