@@ -274,6 +274,14 @@ def test_a_csv_that_leaves_frames_out(tmp_path: Path, capsys: Capture) -> None:
     assert "no row for frame 001.png" in prepared(capsys, folder)
 
 
+def test_only_a_verb_that_has_an_option_advises_it(tmp_path: Path, capsys: Capture) -> None:
+    folder = clip(tmp_path / "clip")
+    (folder / "exposures.csv").write_text("file,ev\n000.png,-2\n")
+    sentence = refused(capsys, "check", folder, "--picture", tmp_path / "a.png")
+    assert "no row for frame 001.png; add it, or rename the list" in sentence
+    assert "no row for frame 001.png; add it, or give `--exposures" in prepared(capsys, folder)
+
+
 LISTS = {
     "file,ev\n000.png,dark\n": "line 2: 'dark' is not a number",
     "file,ev\n000.png,-2\n": "no row for frame 001.png",

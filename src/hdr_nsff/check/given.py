@@ -62,13 +62,15 @@ def given_exposures(footage: Footage, count: int) -> GivenExposures | None:
         path, rows = table
         names = list(footage.files)
         sources = [f"{names[0]}#{i}" if footage.video else names[i] for i in range(count)]
-        return GivenExposures(
-            path.name, [ev_in_list(path, rows, source, i) for i, source in enumerate(sources)]
-        )
+        known = [
+            ev_in_list(path, rows, source, i, advice="add it, or rename the list to ignore it")
+            for i, source in enumerate(sources)
+        ]
+        return GivenExposures(path.name, known)
     if footage.video:
         return None
-    known = [read_exif_ev(path) for path in footage.cameras[0][:count]]
-    found = [ev for ev in known if ev is not None]
+    written = [read_exif_ev(path) for path in footage.cameras[0][:count]]
+    found = [ev for ev in written if ev is not None]
     if len(found) < count or max(found) - min(found) < exposure.MIN_STEP:
         return None
     return GivenExposures("EXIF", found)

@@ -165,15 +165,22 @@ def refuse_scattered(footage: Footage) -> None:
 
 
 def ev_in_list(
-    path: Path, rows: dict[str, float], source: str, number: int, whole_name: bool = False
+    path: Path,
+    rows: dict[str, float],
+    source: str,
+    number: int,
+    whole_name: bool = False,
+    advice: str = "add it, or give `--exposures auto`",
 ) -> float:
     """The EV of a frame in the `rows` of a CSV, by its name `source` or `number`; by
     its `whole_name`, with the folder, only, where several tracks have the others.
+
+    InputError with `advice` where the list lacks it.
     """
     ev = row_of(rows, source, number, whole_name)
     if ev is not None:
         return ev
-    raise InputError(f"{path}: no row for frame {source}; add it, or give `--exposures auto`")
+    raise InputError(f"{path}: no row for frame {source}; {advice}")
 
 
 def row_of(rows: Mapping[str, T], source: str, number: int, whole_name: bool = False) -> T | None:
