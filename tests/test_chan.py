@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from fakes import fake_run
 
+from hdr_nsff.core import notes
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.rendering.chan import write_chan
@@ -72,3 +73,19 @@ def test_two_tracks_of_one_camera_have_one_line_for_every_picture(tmp_path: Path
     export_chan(both, tmp_path / "both.chan")
     export_chan(run, tmp_path / "one.chan")
     assert (tmp_path / "both.chan").read_text() == (tmp_path / "one.chan").read_text()
+
+
+@pytest.mark.parametrize(("num_pictures", "told"), [(2, True), (6, False)])
+def test_pictures_that_were_thinned_out_are_named_with_the_command_for_all(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], num_pictures: int, told: bool
+) -> None:
+    run = replace(fake_run(tmp_path), folder=tmp_path / "run")
+    assert len(plan_shot(run, "training").views) == 6
+    shot = tmp_path / "render/training"  # where the verb `run` puts it
+    views = [notes.SequenceView(time=time, ev=None) for time in range(num_pictures)]
+    note = notes.Sequence(key="", step=1, fps=24, display_exposure=1, views=views, seconds=0)
+    notes.write(shot / "sequence.json", note)
+    export_chan(run, tmp_path / "camera.chan")
+    command = f"`hdr-nsff render {run.folder} --path training --out {shot.parent}`"
+    sentence = f"has 2 of these pictures, numbered otherwise; {command} renders them all"
+    assert (sentence in capsys.readouterr().err) is told

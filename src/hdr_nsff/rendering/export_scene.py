@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from hdr_nsff.core import notes
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.progress import say
 from hdr_nsff.core.tensors import tree_map
@@ -19,6 +20,7 @@ from hdr_nsff.rendering import usd
 from hdr_nsff.rendering.chan import is_chan, write_chan
 from hdr_nsff.rendering.export_gaussians import NOT_OURS
 from hdr_nsff.rendering.exr_header import neutral_gains
+from hdr_nsff.rendering.output import render_folders
 from hdr_nsff.rendering.shot_views import plan_shot
 from hdr_nsff.training.run_folder import Run
 
@@ -131,4 +133,11 @@ def export_chan(run: Run, path: Path) -> Path:
     views = plan_shot(run, "training").views
     write_chan(path, [view.camera for view in views])
     say(f"{path}: {len(views)} cameras, numbered as the pictures of the training path")
+    for folder in render_folders(run.folder):
+        shot = folder / "training"
+        made = notes.read(shot / "sequence.json", notes.Sequence)
+        if made is not None and len(made.views) < len(views):
+            problem = f"has {len(made.views)} of these pictures, numbered otherwise"
+            command = f"hdr-nsff render {run.folder} --path training --out {folder}"
+            say(f"{shot}: {problem}; `{command}` renders them all")
     return path

@@ -5,6 +5,7 @@ developed.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 from hdr_nsff.core.hdr_video import Codec
@@ -83,6 +84,13 @@ class Output:
     """Times between frames: splat along the scene flow, or ask the field directly; auto
     splats where the field can.
     """
+
+
+def render_folders(run: Path) -> list[Path]:
+    """Where shots of a run folder may be: by `render`, then by the verb `run`."""
+    whole = run.resolve()
+    by_run = [whole.parent / "render"] if whole.name == "run" else []
+    return [run / "render", *by_run]
 
 
 def picture_settings(output: Output) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.maths import color
 from hdr_nsff.rendering.develop import develop_view
 from hdr_nsff.rendering.export_page import HDR_CLIP, VIDEOS, find_hdr_clip, run_scene
+from hdr_nsff.rendering.output import render_folders
 from hdr_nsff.rendering.row_bands import render_in_bands
 from hdr_nsff.rendering.shot_views import check_views
 from hdr_nsff.rendering.stills import Still
@@ -62,9 +63,8 @@ class ServedRun:
         return make_page(self.title, None, PageSettings(videos, link, server=True))
 
     def places(self) -> list[Path]:
-        """Folders where the run's videos may be: those of `render`, then of `run`."""
-        own, whole = self.folder / "render", self.folder.resolve()
-        return [own, whole.parent / "render"] if whole.name == "run" else [own]
+        """Folders where the run's videos may be."""
+        return render_folders(self.folder)
 
     def hdr_clip(self) -> Path | None:
         return find_hdr_clip(self.run, self.places()[-1].parent)
