@@ -306,9 +306,9 @@ SECTIONS = (
         "Two of these scenes until PSNR rises by less than 0.1 dB in the last fifth; `splat` and "
         "`grid` still rise on `interior`, `grid` on `lamp`. During the run: eight views after 1/8, "
         "1/4, 1/2, 4/5 and all of it, one thread each. No baseline reaches what `splat` has after "
-        "an eighth, however long it trains. `splat` gains 0.9 dB on `interior` after that and loses "
-        "0.4 on `lamp`: priors limit it. HDR-HexPlane overfits `interior` from half of its run on; "
-        "its published protocol, the left half of views, is not ours.",
+        "an eighth, however long it trains. `splat` gains 0.9 dB on `interior` after that and "
+        "loses 0.4 on `lamp`: priors limit it. HDR-HexPlane overfits `interior` from half of its run "
+        "on; its published protocol, the left half of views, is not ours.",
         "hdr-nsff bench OUT --scenes SCENE --methods nerf-wt,hdr-hexplane,nsff,splat,grid --budget "
         "MINUTES --views 8",
         bench_convergence,
@@ -375,10 +375,10 @@ SECTIONS = (
         "bench-paper-small-ablations",
         "Ablations of the paper at that size",
         "The same scene in 1,000 steps, a twelfth of the run above: one part left out at a time. "
-        "Responses come in the published order, one per image, fixed, none; but the paper loses 5.5 "
-        "dB by a fixed one, which here has the exact exposures. Flow and depth change little, which "
-        "one run of each does not settle. Without the split, which the paper never leaves out, "
-        "full pictures are worse and moving pixels better.",
+        "Responses come in the published order, one per image, fixed, none; but the paper loses "
+        "5.5 dB by a fixed one, which here has the exact exposures. Flow and depth change little, "
+        "which one run of each does not settle. Without the split, which the paper never leaves "
+        "out, full pictures are worse and moving pixels better.",
         "hdr-nsff bench OUT --scenes interior --oracle --steps 1000 --views 0 --methods "
         '"paper-small=paper-small --torch-threads 1,..."',
         bench_scores_of_one,
