@@ -307,8 +307,8 @@ SECTIONS = (
         "`grid` still rise on `interior`, `grid` on `lamp`. During the run: eight views after 1/8, "
         "1/4, 1/2, 4/5 and all of it, one thread each. No baseline reaches what `splat` has after "
         "an eighth, however long it trains. `splat` gains 0.9 dB on `interior` after that and "
-        "loses 0.4 on `lamp`: priors limit it. HDR-HexPlane overfits `interior` from half of its run "
-        "on; its published protocol, the left half of views, is not ours.",
+        "loses 0.4 on `lamp`: priors limit it. HDR-HexPlane overfits `interior` from half of its "
+        "run on; its published protocol, the left half of views, is not ours.",
         "hdr-nsff bench OUT --scenes SCENE --methods nerf-wt,hdr-hexplane,nsff,splat,grid --budget "
         "MINUTES --views 8",
         bench_convergence,
