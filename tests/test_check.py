@@ -297,7 +297,26 @@ def test_frames_that_timestamps_miss_are_counted() -> None:
     good = good_facts()
     found = judge(replace(good, file=replace(good.file, missing=2, interval_ms=(41.0, 84.0))))
     timing = [f.text for f in found if f.subject == "timing"]
-    assert timing == ["2 frames are missing by the timestamps of the video"]
+    assert timing == ["2 frames are missing by the timestamps"]
+
+
+def test_timestamps_of_a_list_are_read(tmp_path: Path) -> None:
+    clip = clip_of(tmp_path, still_scene, [0.0] * FRAMES)
+
+    def timing(ms: list[object]) -> tuple[FileFacts, list[str]]:
+        rows = [f"{t},0,{time}000000" for t, time in enumerate(ms)]
+        (clip / "exposures.csv").write_text("\n".join(["frame,ev,timestamp_ns", *rows]))
+        facts, _, _ = measure_clip(clip)
+        return facts.file, [f.text for f in judge(facts) if f.subject == "timing"]
+
+    even = [40 * t for t in range(FRAMES + 1)]
+    file, found = timing(even[:4] + even[5:])
+    assert file.missing == 1 and found == ["1 frame is missing by the timestamps"]
+    file, found = timing([*even[:4], even[3], *even[5:FRAMES]])
+    sentence = "the timestamp_ns of frame 004.png is not above that of frame 003.png"
+    assert file.interval_ms is None and found == [f"{sentence}; frames are taken as evenly spaced"]
+    with pytest.raises(InputError, match="'x000000' is not a number"):
+        timing(["x"] * FRAMES)
 
 
 def test_bad_input_is_one_sentence(tmp_path: Path) -> None:

@@ -41,6 +41,30 @@ def test_a_frame_that_is_missing_leaves_a_gap_and_the_cycle_goes_on(
     assert times(work) == WITH_GAP
 
 
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({5: "160000000"}, "the timestamp_ns of frame 005.png is not above that of frame 004.png"),
+        ({5: "0"}, "the timestamp_ns of frame 005.png is not above that of frame 004.png"),
+        ({5: None}, "frame 005.png has no timestamp_ns"),
+    ],
+)
+def test_timestamps_that_show_no_times_are_named(
+    change: dict[int, str | None],
+    problem: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    rows = {t: str(40_000_000 * t) for t in range(12)} | change
+    lines = [f"{t:03d}.png,0,{ns}" for t, ns in rows.items() if ns is not None]
+    (tmp_path / "clip").mkdir()
+    (tmp_path / "clip/exposures.csv").write_text("\n".join(["file,ev,timestamp_ns", *lines]))
+    work = work_on(tmp_path, clip([0], frames=12))
+    printed = " ".join(capsys.readouterr().err.split())
+    assert f"frames: {problem}; all count as evenly spaced" in printed
+    assert times(work) == list(range(12))
+
+
 def test_without_a_gap_frames_are_evenly_spaced(tmp_path: Path) -> None:
     work = work_on(tmp_path, clip(EVS, frames=27))
     exposure_step(work)

@@ -20,9 +20,11 @@ class FileFacts:
     fps: float
     bits: int
     kind: str  # recorded, linear, hlg, pq
-    # milliseconds: the shortest and longest time between frames, of videos
+    # milliseconds: the shortest and longest time between frames, by timestamps; None
+    # without these
     interval_ms: tuple[float, float] | None
-    missing: int = 0  # frames by the timestamps of a video
+    missing: int = 0  # frames by these timestamps
+    timestamps_problem: str = ""  # why a list does not show the times, in words
     bars: str = ""  # what `prepare` does with black bars, in words
     interlaced: bool = False  # by the marks of its frames
 

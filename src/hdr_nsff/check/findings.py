@@ -291,8 +291,12 @@ def judge_file(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
         text = f"frames are missing before frame {listed}: the exposure cycle skips a part"
         advice = "`prepare` leaves gaps in time; use a faster card, or record at a lower rate"
         yield Finding("warning", "timing", text, advice)
+    if file.timestamps_problem:
+        text = f"{file.timestamps_problem}; frames are taken as evenly spaced"
+        yield Finding("warning", "timing", text, "correct the column, or leave it out")
     if file.missing:
-        text = f"{file.missing} frames are missing by the timestamps of the video"
+        many = "1 frame is" if file.missing == 1 else f"{file.missing} frames are"
+        text = f"{many} missing by the timestamps"
         advice = "`prepare` leaves gaps in time; use a faster card, or record at a constant rate"
         yield Finding("warning", "timing", text, advice)
     elif file.interval_ms is not None:

@@ -4,27 +4,26 @@ the cycle by brightness, SIFT matches on equalized frames, rotations that explai
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from hdr_nsff.check.drift import drift_contradictions, measure_drift
-from hdr_nsff.check.facts import CameraFacts, CameraMotion, ClipFacts, ExposureFacts, FileFacts
+from hdr_nsff.check.facts import CameraFacts, CameraMotion, ClipFacts, ExposureFacts
+from hdr_nsff.check.file import describe_file
 from hdr_nsff.check.given import GivenExposures, given_exposures
 from hdr_nsff.check.lens import measure_lens
 from hdr_nsff.check.shutter import measure_readout
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.progress import track
 from hdr_nsff.core.stack import spread_frames
-from hdr_nsff.core.video import frame_times, video_info
 from hdr_nsff.footage.bars import with_bars
 from hdr_nsff.footage.cuts import find_cuts
-from hdr_nsff.footage.footage import Footage, open_footage
+from hdr_nsff.footage.footage import open_footage
 from hdr_nsff.footage.frame_choice import check_frame_size
-from hdr_nsff.footage.ingest import MAX_FRAMES, read_frames
-from hdr_nsff.footage.timestamps import frame_gaps
+from hdr_nsff.footage.ingest import read_frames
 from hdr_nsff.priors.poses.estimate import PosesTuning, believed_share, shaken_poses
 from hdr_nsff.priors.poses.matching import (
     Keypoints,
@@ -102,33 +101,6 @@ def measure_clip(
         camera=measure_camera(equalized, clipped, cycle, keypoints, following, scale, tuning),
     )
     return facts, video, cycle.brackets
-
-
-def describe_file(footage: Footage) -> FileFacts:
-    """The file's header, or the first frame of a folder."""
-    first = footage.cameras[0][0]
-    kind = "linear" if footage.linear else (footage.transfer or "recorded")
-    frame = next(read_frames(footage, 0, 1, 1, MAX_FRAMES))
-    height, width = frame.rgb.shape[:2]
-    bits, interval, missing = 8, None, 0
-    if footage.video:
-        bits = video_info(first).bits
-        times = frame_times(first)
-        gaps = np.diff(times) * 1000
-        steps = frame_gaps(times.tolist())
-        missing = 0 if steps is None else round(float((steps - 1).sum()))
-        if len(gaps):
-            interval = (round(float(gaps.min()), 2), round(float(gaps.max()), 2))
-    elif not footage.linear:
-        depth = cv2.imread(str(first), cv2.IMREAD_UNCHANGED)
-        bits = 16 if depth is not None and depth.dtype == np.uint16 else 8
-    else:
-        bits = 16
-    cameras = len(footage.cameras)
-    name, count, fps = footage.path.name, footage.count, footage.fps
-    bars = footage.bars.sentence() if footage.bars else ""
-    facts = FileFacts(name, count, cameras, width, height, fps, bits, kind, interval, missing, bars)
-    return replace(facts, interlaced=footage.interlaced)
 
 
 # Exposure

@@ -52,6 +52,19 @@ def read_timestamps(footage: Footage) -> dict[str, float]:
     return seconds
 
 
+def timestamps_problem(seconds: Sequence[float | None], names: Sequence[str]) -> str | None:
+    """Why the timestamps of frames do not show when these were taken, in words; None
+    where they do. `seconds` and `names` (T,) of the frames in order.
+    """
+    for k, (here, name) in enumerate(zip(seconds, names, strict=True)):
+        if here is None:
+            return f"frame {name} has no {COLUMN}"
+        before = seconds[k - 1] if k else None
+        if before is not None and here <= before:
+            return f"the {COLUMN} of frame {name} is not above that of frame {names[k - 1]}"
+    return None
+
+
 def usual_gap(seconds: Sequence[float | None], stride: int = 1) -> float | None:
     """Seconds from one frame of the footage to the next, of those that are not longer
     because frames are missing; None where timestamps do not show it.

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from hdr_nsff.footage.timestamps import frame_gaps, read_timestamps, usual_gap
+from hdr_nsff.core.progress import say
+from hdr_nsff.footage.exposure_lists import row_of
+from hdr_nsff.footage.timestamps import (
+    frame_gaps,
+    read_timestamps,
+    timestamps_problem,
+    usual_gap,
+)
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.scene.manifest import FrameEntry
 
@@ -20,6 +27,7 @@ def leave_gaps(work: Work, entries: list[FrameEntry], seconds: list[float | None
         return 0
     written = read_timestamps(work.footage)
     stride = work.config.stride
+    problems: list[str | None] = []
     lines: dict[tuple[int, int], list[int]] = {}
     for k, entry in enumerate(entries):
         lines.setdefault((entry.camera_id, entry.track), []).append(k)
@@ -28,7 +36,10 @@ def leave_gaps(work: Work, entries: list[FrameEntry], seconds: list[float | None
         known = [seconds[k] for k in line]
         if written:
             known = [seconds_of(work, entries[k], written) for k in line]
+            problems.append(timestamps_problem(known, [entries[k].source for k in line]))
         found.append(frame_gaps(known, stride))
+    if problem := next(filter(None, problems), None):
+        say(f"frames: {problem}; all count as evenly spaced")
     first = found[0]
     if first is None or not all(g is not None and np.array_equal(g, first) for g in found):
         return 0
@@ -56,11 +67,7 @@ def frame_seconds(work: Work, entries: list[FrameEntry]) -> float | None:
 def seconds_of(work: Work, entry: FrameEntry, written: dict[str, float]) -> float | None:
     """The seconds of a frame in a CSV, by its name or number; None without."""
     number = work.config.start + int(entry.time) * work.config.stride
-    name = entry.source.rsplit("/", 1)[-1]
-    for key in (entry.source, name, f"#{number}"):
-        if key in written:
-            return written[key]
-    return None
+    return row_of(written, entry.source, number)
 
 
 def by_timestamps(work: Work) -> bool:
