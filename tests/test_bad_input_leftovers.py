@@ -107,7 +107,7 @@ def making(folder: Path) -> list[list[object]]:
 
 Change = Callable[[dict], object]
 PLAN, VIEWS, METRICS = "run/render/plan.json", "run/render/views.json", "run/metrics.json"
-SEQUENCE, EXPORTED = "run/render/training/sequence.json", "ply/sequence.json"
+SEQUENCE, EXPORTED = "run/render/training/sequence.json", "ply.sequence.json"
 KINDS: dict[str, type[notes.Note]] = {
     PLAN: notes.RenderPlan,
     VIEWS: notes.PictureRanges,

@@ -4,6 +4,7 @@ sentences; restarts keep what is there.
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import torch
 from fakes import fake_run
 from presets import random_field, small
 
+from hdr_nsff.core import notes
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.fields.kernels.footprint import ALPHA_MIN
 from hdr_nsff.fields.splat.rasterize import rasterize
@@ -152,6 +154,19 @@ def test_a_sequence_has_a_file_per_training_time(run: Run, tmp_path: Path) -> No
     assert [f.name for f in files] == [f"{i:05d}.ply" for i in range(len(run.scene.train))]
     alone = export_one(run, tmp_path / "alone.ply", run.scene.train[3].time, LINEAR)
     assert files[3].read_bytes() == alone.read_bytes()
+    note = notes.read(tmp_path / "sequence.sequence.json", notes.ExportedSequence)
+    assert note is not None and note.times == [f.time for f in run.scene.train]
+
+
+def test_supersplat_recognizes_a_sequence(run: Run, tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    export_sequence(run, folder, LINEAR)
+    note = tmp_path / "out.sequence.json"
+    note.rename(folder / "sequence.json")  # as older versions have left it
+    export_sequence(run, folder, LINEAR)
+    names = re.compile(r"(.*?)(\d+)(?:\.compressed)?\.ply$")  # all files of a sequence match
+    assert note.is_file() and len(list(folder.iterdir())) == len(run.scene.train)
+    assert all(names.match(file.name) for file in folder.iterdir())
 
 
 def test_a_restart_exports_only_the_missing_files(

@@ -73,7 +73,7 @@ class Sequence(Note):
 
 
 class ExportedSequence(Note):
-    """`sequence.json` of exported Gaussians."""
+    """`FOLDER.sequence.json` beside a folder of exported Gaussians."""
 
     marks = ("key", "times")
     key: str

@@ -75,7 +75,8 @@ def export_one(run: Run, path: Path, time: float, transform: ColorTransform) -> 
 def export_sequence(run: Run, folder: Path, transform: ColorTransform) -> Path:
     """Write `folder/00000.ply`, ... at the training times, in order.
 
-    Files already there with the same fingerprint are kept.
+    Nothing else is in the folder, as players ask for. Files already there with the same
+    fingerprint are kept.
     """
     source = gaussian_field(run, transform)
     times = sorted({f.time for f in run.scene.train})
@@ -102,8 +103,11 @@ def open_sequence(
     for file in files:
         if not ply.is_ours(file):
             raise InputError(f"{file}: {NOT_OURS}; choose another folder")
-    path = folder / "sequence.json"
+    path = note_path(folder)
     found = notes.read(path, notes.ExportedSequence)
+    inside = folder / "sequence.json"  # where older versions have left it
+    if notes.read(inside, notes.ExportedSequence) is not None:
+        inside.unlink()
     if found is not None and found.key == key:
         return found
     if files:
@@ -114,6 +118,12 @@ def open_sequence(
     note = notes.ExportedSequence(key=key, step=run.step, times=times, display_exposure=exposure)
     notes.write(path, note)
     return note
+
+
+def note_path(folder: Path) -> Path:
+    """Where the note of a sequence is: beside its folder."""
+    place = folder.resolve()
+    return place.with_name(f"{place.name}.sequence.json")
 
 
 def gaussian_field(run: Run, transform: ColorTransform) -> GaussianField:
