@@ -81,6 +81,18 @@ def test_a_given_drift_is_kept_and_the_curve_fitted_to_it():
     assert response.source == "static points" and not response.problem
 
 
+def test_views_with_a_given_drift_may_come_in_any_order():
+    drift = smooth_drift(3.0)
+    views = drifting_views(S_CURVE, drift, (1,))
+    in_time = estimate_response(views, [0] * NUM, [0.0], 0, 1, drift=drift)
+    order = np.random.default_rng(0).permutation(NUM)
+    mixed = [views[i] for i in order]
+    found = estimate_response(mixed, [0] * NUM, [0.0], 0, 1, drift=drift[order])
+    np.testing.assert_array_equal(found.drift, drift[order])
+    assert not found.problem and found.misfit == in_time.misfit
+    np.testing.assert_array_equal(found.y, in_time.y)
+
+
 @pytest.mark.parametrize("known", [True, False])
 def test_little_drift_leaves_the_curve_alone(known):
     drift = smooth_drift(0.6)

@@ -101,18 +101,20 @@ def with_given_drift(
     """The response where the exposures `ev` (B,) of brackets and the `drift` (V,) of
     frames are given; gamma 2.2 where points are too few.
     """
-    readings = read_points(views, np.random.default_rng(SEED), tuning.frames)
     response = replace(response, drift=drift)
+    ordered = sorted(range(len(views)), key=lambda i: views[i].time)
+    in_time = [views[i] for i in ordered]
+    readings = read_points(in_time, np.random.default_rng(SEED), tuning.frames)
     if not is_determined(readings, len(views), tuning.frames):
         return response
-    exposures = np.array([float(ev[v.bracket] or 0.0) for v in views]) + drift
+    exposures = np.array([float(ev[v.bracket] or 0.0) for v in in_time]) + drift[ordered]
     if np.ptp(exposures) < tuning.min_range:
         return response
     samples = replace(readings.samples, offset=exposures[readings.frame])
     fit = debevec(samples, [0.0] * readings.frame.shape[1], 0, tuning.debevec)
     if problem := problem_of(fit.x, fit.y, fit.misfit, tuning):
         return replace(response, problem=problem)
-    brackets = np.array([v.bracket for v in views])
+    brackets = np.array([v.bracket for v in in_time])
     seen = frame_log_exposures(readings, fit.x, fit.y, brackets, tuning.frames)
     off = np.abs(seen - seen.mean() - exposures + exposures.mean())
     problem = ""
