@@ -35,7 +35,9 @@ class CheckConfig:
     clip: tyro.conf.Positional[Path]
     """Footage: a video, a folder of frames, or a folder of such folders."""
     picture: Path | None = None
-    """The picture to write; default: CLIP_check.png in the current folder."""
+    """The picture to write; its folder is made where there is none. Default:
+    CLIP_check.png in the current folder.
+    """
     json: bool = False
     """Print facts and findings as JSON instead of sentences."""
 
