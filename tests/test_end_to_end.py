@@ -3,6 +3,7 @@ radiance is known in closed form, then every other verb on what it made.
 """
 
 import json
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -16,8 +17,11 @@ from hdr_nsff.core.exr import read_exr
 from hdr_nsff.core.images import read_image, write_png
 from hdr_nsff.core.io import read_npy, write_npy
 from hdr_nsff.core.video import read_video
+from hdr_nsff.pipeline import finish_scene
 from hdr_nsff.rendering.shot_views import filmed_frames
 from hdr_nsff.scene.manifest import Manifest
+from hdr_nsff.training.budget import Budget
+from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.run_folder import Run
 
 FRAMES, WIDTH, HEIGHT = 14, 112, 64
@@ -174,10 +178,13 @@ def psnr_of(run: Path) -> float:
 def test_gaussians_of_the_same_scene_are_closer_to_it_and_move_between_frames(
     out: Path, tmp_path: Path
 ) -> None:
+    """They also have a page to look around in, which the report links to."""
     run = tmp_path / "run"
-    places = ["--scene", str(out / "scene"), "--out", str(run)]
-    cli.main(["train", "splat", *places, "--steps", "250", *CPU])
-    cli.main(["evaluate", str(run), *CPU])
+    places = {"scene": out / "scene", "out": run, "device": "cpu"}
+    settings = replace(PRESETS["splat"], budget=Budget(steps=250, minutes=None), **places)
+    made = finish_scene(settings, None)
+    assert made["viewer"] == tmp_path / "scene.html" and (tmp_path / "scene.html").is_file()
+    assert 'href="scene.html"' in (tmp_path / "report.html").read_text()
     assert psnr_of(run) > psnr_of(out / "run") + 1
     cli.main(["render", str(run), "--path", "slowmo", "--factor", "2", "--no-video", *CPU])
     moving = [read_exr(p)["motion"] for p in sorted((run / "render/slowmo").glob("*.exr"))[4:9]]
