@@ -240,7 +240,9 @@ def test_hdr_references_hold_the_linearized_clip(tmp_path):
         write_png(clip / f"{t:03d}.png", np.full((64, 64, 3), 0.1 * (t + 1)))
     config = ReexposeConfig(clip, tmp_path / "out", hdr_video=("pq", "hlg"))
     out = reexpose(config)
-    reexpose(replace(config, hdr_video=("pq",), hdr_still=("png16",)))  # the same problem
+    others = replace(config, hdr_video=("pq",), hdr_codec="prores", hdr_still=("png16",))
+    reexpose(others)  # the same problem
+    assert decoded(out / "reference_pq_prores.mov")[0].codec_context.name == "prores"
     still = cv2.imread(str(out / "reference/00003_pq.png"), cv2.IMREAD_UNCHANGED)
     light = display_light(np.full((1, 1, 3), 0.4**2.2), 1.0, "pq")
     assert np.allclose(pq_decode(still / 65535), light, rtol=0.01)

@@ -11,6 +11,7 @@ from test_ultra_hdr import decode
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import read_exr
+from hdr_nsff.core.hdr_video import Codec
 from hdr_nsff.core.images import read_image, read_mask
 from hdr_nsff.core.io import read_npy, write_text
 from hdr_nsff.core.video import read_video
@@ -229,10 +230,16 @@ def test_a_killed_rig_continues_and_does_not_mix_with_one_camera(flat: SynthConf
         synth(flat)
 
 
-def test_hdr_references_hold_the_radiance_of_the_clip(flat: SynthConfig) -> None:
-    config = replace(flat, size="64x64", hdr_video=("pq",))
+@pytest.mark.parametrize(
+    ("codec", "name"), [("hevc", "reference_pq.mp4"), ("av1", "reference_pq_av1.mp4")]
+)
+def test_hdr_references_hold_the_radiance_of_the_clip(
+    flat: SynthConfig, codec: Codec, name: str
+) -> None:
+    config = replace(flat, size="64x64", hdr_video=("pq",), hdr_codec=codec)
     synth(config)
-    _, frames = decoded(flat.out / "reference_pq.mp4")
+    stream, frames = decoded(flat.out / name)
+    assert stream.codec_context.name == {"hevc": "hevc", "av1": "libdav1d"}[codec]
     assert len(frames) == flat.frames
     light = display_light(np.full((2, 2, 3), 0.18), 1.0, "pq")  # an even wall is mid gray
     expected = ycbcr_planes(encode(light, "pq"))[0][0, 0]

@@ -20,6 +20,13 @@ from hdr_nsff.core.hdr_video import (
 )
 from hdr_nsff.maths.hdr_signal import PEAK_NITS, Transfer, display_light, encode, ycbcr_planes
 
+ENDINGS = {"hevc": ".mp4", "av1": "_av1.mp4", "prores": "_prores.mov"}
+
+
+def hdr_path(out: Path, name: str, transfer: Transfer, codec: Codec) -> Path:
+    """`NAME_hlg.mp4` or `NAME_pq.mp4`; of other codecs `NAME_hlg_av1.mp4` and so on."""
+    return out / f"{name}_{transfer}{ENDINGS[codec]}"
+
 
 def write_radiance_video(
     path: Path,

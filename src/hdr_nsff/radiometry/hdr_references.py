@@ -3,32 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from hdr_nsff.core.hdr_video import check_encoder, check_side
+from hdr_nsff.core.hdr_video import Codec, check_encoder, check_rate, check_side
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.maths import color
 from hdr_nsff.maths.hdr_signal import Transfer
-from hdr_nsff.radiometry.hdr_footage import write_radiance_video
+from hdr_nsff.radiometry.hdr_footage import hdr_path, write_radiance_video
 from hdr_nsff.radiometry.hdr_stills import HdrStill, still_path, write_hdr_still
 
 FOLDER = "reference"  # of the stills, in the output folder
 
 
+@dataclass(frozen=True)
+class ReferenceKinds:
+    """Which references are wanted."""
+
+    videos: tuple[Transfer, ...]
+    codec: Codec  # of the videos
+    stills: tuple[HdrStill, ...]
+
+
 def check_references(
-    footage: Path,
-    size: tuple[int, int],
-    videos: tuple[Transfer, ...],
-    stills: tuple[HdrStill, ...],
+    footage: Path, size: tuple[int, int], fps: float, kinds: ReferenceKinds
 ) -> None:
     """InputError where frames of `size` (width, height) cannot be written so."""
-    if videos:
-        check_encoder("hevc")
-    if "avif" in stills:
+    if kinds.videos:
+        check_encoder(kinds.codec)
+        check_rate(footage, kinds.codec, fps)
+    if "avif" in kinds.stills:
         check_encoder("av1")
-    if videos or "avif" in stills:
+    if kinds.videos or "avif" in kinds.stills:
         check_side(footage, *size)
 
 
@@ -38,21 +46,20 @@ def write_references(
     num_frames: int,
     fps: float,
     exposure: float,
-    videos: tuple[Transfer, ...],
-    stills: tuple[HdrStill, ...],
+    kinds: ReferenceKinds,
 ) -> None:
     """Write what is asked for of `frames()`, linear Rec. 709 radiance (H, W, 3).
 
     `exposure` brings diffuse white to 1. Stills that are there are kept.
     """
-    for transfer in videos:
-        path = out / f"reference_{transfer}.mp4"
-        write_radiance_video(path, frames, transfer, "hevc", fps, exposure)
+    for transfer in kinds.videos:
+        path = hdr_path(out, "reference", transfer, kinds.codec)
+        write_radiance_video(path, frames, transfer, kinds.codec, fps, exposure)
         say(f"{path}: the radiance of the clip")
-    if not stills:
+    if not kinds.stills:
         return
     for k, radiance in enumerate(track(frames(), "HDR stills", num_frames)):
-        write_stills(out / FOLDER / f"{k:05d}.png", radiance, exposure, stills)
+        write_stills(out / FOLDER / f"{k:05d}.png", radiance, exposure, kinds.stills)
     say(f"{out / FOLDER}: the radiance of the clip")
 
 

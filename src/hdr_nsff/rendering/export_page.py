@@ -13,8 +13,9 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.hdr_video import Codec
 from hdr_nsff.core.io import atomic, write_text
 from hdr_nsff.core.progress import say
+from hdr_nsff.radiometry.hdr_footage import hdr_path
 from hdr_nsff.rendering.export_gaussians import NOT_OURS, ColorTransform, exposure_of
-from hdr_nsff.rendering.hdr_shots import TRANSFERS, hdr_path
+from hdr_nsff.rendering.hdr_shots import TRANSFERS
 from hdr_nsff.training.run_folder import Run
 from hdr_nsff.viewer.field_scene import scene_of
 from hdr_nsff.viewer.page_file import MARK, Link, PageSettings, make_page

@@ -15,7 +15,7 @@ from hdr_nsff.core.exr import read_exr
 from hdr_nsff.core.hdr_video import Codec
 from hdr_nsff.core.images import read_image
 from hdr_nsff.maths.hdr_signal import Transfer
-from hdr_nsff.radiometry.hdr_footage import write_radiance_video
+from hdr_nsff.radiometry.hdr_footage import hdr_path, write_radiance_video
 from hdr_nsff.radiometry.hdr_stills import still_path, write_hdr_still
 from hdr_nsff.rendering.exr_header import WhiteBalance, balance, unbalance
 from hdr_nsff.rendering.output import Output, Shot, ev_of
@@ -23,12 +23,6 @@ from hdr_nsff.training.run_folder import Run
 
 TRANSFERS: tuple[Transfer, ...] = ("hlg", "pq")
 CODECS: tuple[Codec, ...] = ("hevc", "av1", "prores")
-ENDINGS = {"hevc": ".mp4", "av1": "_av1.mp4", "prores": "_prores.mov"}
-
-
-def hdr_path(out: Path, name: str, transfer: Transfer, codec: Codec) -> Path:
-    """`NAME_hlg.mp4` or `NAME_pq.mp4`; of other codecs `NAME_hlg_av1.mp4` and so on."""
-    return out / f"{name}_{transfer}{ENDINGS[codec]}"
 
 
 def hdr_paths(

@@ -26,6 +26,7 @@ from tyro.conf import Positional
 from hdr_nsff.core.errors import InputError, check_number
 from hdr_nsff.core.exr import write_exr
 from hdr_nsff.core.hashes import hash_file
+from hdr_nsff.core.hdr_video import Codec
 from hdr_nsff.core.images import read_mask, write_png
 from hdr_nsff.core.io import is_leftover, read_json, write_json, writing_to
 from hdr_nsff.core.lock import lock_output
@@ -42,7 +43,11 @@ from hdr_nsff.footage.pose_files import import_poses
 from hdr_nsff.geometry.poses import Poses
 from hdr_nsff.maths.hdr_signal import Transfer
 from hdr_nsff.radiometry import exposure_cycle as exposure
-from hdr_nsff.radiometry.hdr_references import check_references, write_references
+from hdr_nsff.radiometry.hdr_references import (
+    ReferenceKinds,
+    check_references,
+    write_references,
+)
 from hdr_nsff.radiometry.hdr_stills import HdrStill
 from hdr_nsff.radiometry.recording import Curve, record, response_curve
 from hdr_nsff.scene.truth import Truth, TruthView
@@ -77,6 +82,8 @@ class ReexposeConfig:
     """Also write the linearized clip as 10-bit HDR video, reference_hlg.mp4 and
     reference_pq.mp4: hlg, pq or both. Its white is diffuse white.
     """
+    hdr_codec: Codec = "hevc"
+    """Of these videos: hevc, av1 or prores (4444, MOV), as `render` has it."""
     hdr_still: tuple[HdrStill, ...] = ()
     """Also write its frames as HDR stills into reference/: ultrahdr (JPEG with a gain
     map), avif, png16 (both PQ).
@@ -153,7 +160,8 @@ def reexpose(config: ReexposeConfig) -> Path:
         numbers, extents, size = look_through(config, footage)
         if not numbers:
             raise InputError(no_frame(config.clip, config.start, footage.count))
-        check_references(config.clip, (size[1], size[0]), config.hdr_video, config.hdr_still)
+        fps = footage.fps / config.stride
+        check_references(config.clip, (size[1], size[0]), fps, reference_kinds(config))
         plan = plan_frames(len(numbers), len(evs), config.hold_out, config.poses is not None)
         poses = None
         if config.poses is not None:
@@ -239,7 +247,7 @@ def claim(config: ReexposeConfig, footage: Footage) -> None:
     """Write `reexpose.json`; InputError where the output holds something else."""
     settings: dict[str, Any] = {"clip": str(config.clip)}
     for name, value in asdict(config).items():
-        if name not in ("clip", "out", "hdr_video", "hdr_still"):
+        if name not in ("clip", "out", "hdr_video", "hdr_codec", "hdr_still"):
             settings[name] = str(value) if isinstance(value, Path) else value
     settings["inputs"] = {name: hash_file(file) for name, file in footage.files.items()}
     path = config.out / "reexpose.json"
@@ -346,8 +354,12 @@ def write_linearized(config: ReexposeConfig, footage: Footage, num_frames: int) 
         return (frame.rgb.astype(np.float64) ** GAMMA for frame in chosen(config, footage))
 
     fps = footage.fps / config.stride
-    kinds = config.hdr_video, config.hdr_still
-    write_references(config.out, radiance, num_frames, fps, 1.0, *kinds)
+    write_references(config.out, radiance, num_frames, fps, 1.0, reference_kinds(config))
+
+
+def reference_kinds(config: ReexposeConfig) -> ReferenceKinds:
+    """The HDR references that are asked for."""
+    return ReferenceKinds(config.hdr_video, config.hdr_codec, config.hdr_still)
 
 
 def write_truth(

@@ -10,6 +10,7 @@ import numpy as np
 from tyro.conf import Positional
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.hdr_video import Codec
 from hdr_nsff.geometry.lens import Lens
 from hdr_nsff.maths.hdr_signal import Transfer
 from hdr_nsff.radiometry.hdr_stills import HdrStill
@@ -82,6 +83,8 @@ class SynthConfig:
     """Also write the clip's radiance as 10-bit HDR video, reference_hlg.mp4 and
     reference_pq.mp4: hlg, pq or both.
     """
+    hdr_codec: Codec = "hevc"
+    """Of these videos: hevc, av1 or prores (4444, MOV), as `render` has it."""
     hdr_still: tuple[HdrStill, ...] = ()
     """Also write its frames as HDR stills into reference/: ultrahdr (JPEG with a gain
     map), avif, png16 (both PQ).

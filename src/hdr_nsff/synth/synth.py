@@ -43,7 +43,11 @@ from hdr_nsff.core.video import DEFAULT_FPS, write_video
 from hdr_nsff.geometry import pinhole
 from hdr_nsff.geometry.lens import Lens, distorted_picture
 from hdr_nsff.maths import color
-from hdr_nsff.radiometry.hdr_references import check_references, write_references
+from hdr_nsff.radiometry.hdr_references import (
+    ReferenceKinds,
+    check_references,
+    write_references,
+)
 from hdr_nsff.radiometry.recording import record, response_curve, vignette
 from hdr_nsff.scene.truth import Truth, TruthView
 from hdr_nsff.synth.motion import UV, exact_flow, view_geometry
@@ -68,7 +72,7 @@ from hdr_nsff.synth.views import TracedView, clip_views, held_out_views
 
 __all__ = ["SynthConfig", "synth"]
 
-NOT_OF_THE_SCENE = ("out", "variant", "hdr_video", "hdr_still")  # settings
+NOT_OF_THE_SCENE = ("out", "variant", "hdr_video", "hdr_codec", "hdr_still")  # settings
 VIDEO_FPS = DEFAULT_FPS  # of all videos
 LENS_PREFIX = "lens"  # of their names
 VIDEO_CRF = 4  # an error of 1.4 levels, below the recording's own noise
@@ -88,7 +92,7 @@ def synth(config: SynthConfig) -> None:
     size = parse_size(config.size)
     evs = parse_ev(ev)
     check(config, min(spp, truth_spp), scene.max_frames)
-    check_references(config.out, size, config.hdr_video, config.hdr_still)
+    check_references(config.out, size, VIDEO_FPS, reference_kinds(config))
     clip = clip_views(scene, config.frames, spp, config.seed, config.views)
     held_out = held_out_views(scene, config.frames, truth_spp, config.seed, config.views)
     K = intrinsics(*size)
@@ -294,8 +298,7 @@ def lens_radiance(view: TracedView, lens: Lens | None, out: Path) -> np.ndarray:
 
 def write_traced(clip: list[TracedView], config: SynthConfig) -> None:
     """Write the radiance of the clip as the HDR references that are asked for."""
-    kinds = config.hdr_video, config.hdr_still
-    if not any(kinds):
+    if not (config.hdr_video or config.hdr_still):
         return
     frames = [exact_path(config.out, view) for view in clip]
     probes = [frames[i] for i in sorted({0, len(frames) // 2, len(frames) - 1})]
@@ -304,7 +307,12 @@ def write_traced(clip: list[TracedView], config: SynthConfig) -> None:
     def radiance() -> Iterator[np.ndarray]:
         return (read_exr(path)["RGB"] for path in frames)
 
-    write_references(config.out, radiance, len(frames), VIDEO_FPS, white, *kinds)
+    write_references(config.out, radiance, len(frames), VIDEO_FPS, white, reference_kinds(config))
+
+
+def reference_kinds(config: SynthConfig) -> ReferenceKinds:
+    """The HDR references that are asked for."""
+    return ReferenceKinds(config.hdr_video, config.hdr_codec, config.hdr_still)
 
 
 def list_exposures(evs: list[float], config: SynthConfig) -> None:
