@@ -17,7 +17,7 @@ from hdr_nsff.core.param_group import ParamGroup
 from hdr_nsff.fields.base import Render
 from hdr_nsff.fields.outputs import Layers
 from hdr_nsff.geometry.cameras import Camera
-from hdr_nsff.radiometry.estimate_response import from_brightness
+from hdr_nsff.radiometry.bracket_response import from_brightness
 from hdr_nsff.radiometry.static_samples import ResponseView
 from hdr_nsff.scene.manifest import FrameEntry, Manifest, StepRecord
 from hdr_nsff.scene.scene import Frame, Scene

@@ -9,14 +9,14 @@ from estimates import tone_mapper
 from wall import EV, GAMMA22, S_CURVE, rmse, wall_view
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.radiometry.estimate_response import (
-    Response,
+from hdr_nsff.radiometry.bracket_response import (
     ResponseTuning,
     alternating_medians,
-    estimate_response,
     problem_of,
 )
+from hdr_nsff.radiometry.estimate_response import estimate_response
 from hdr_nsff.radiometry.one_exposure import at_one_exposure
+from hdr_nsff.radiometry.response import Response
 from hdr_nsff.radiometry.response_words import describe
 from hdr_nsff.scene.response import read_response, write_response
 from hdr_nsff.tonemap.base import ToneMapper
