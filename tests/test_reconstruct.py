@@ -20,6 +20,7 @@ from hdr_nsff.priors.poses.reconstruct import (
     sfm_views,
     tuning_for_lenses,
 )
+from hdr_nsff.priors.poses.view_matches import EarlierRounds
 
 
 def test_cameras_of_a_rig_at_rest_share_one_view():
@@ -121,3 +122,40 @@ def test_no_more_mappings_than_allowed_are_tried(tmp_path, monkeypatch, limit, t
     with pytest.raises(InputError, match="nothing matches"):
         best_model(views_of(5), tmp_path, 1, "sift", tuning)
     assert len(jobs) == tried
+
+
+@pytest.mark.parametrize(
+    ("ways", "tried", "taken"),
+    [
+        ([(250, 0.6), (260, 0.3)], 1, 250),  # the first good one
+        ([(60, 0.4), (250, 0.6), (60, 0.1), (300, 0.3)], 5, 300),  # the best good one
+        ([(None, 0.0), (250, 0.6), (300, 0.3)], 2, 250),  # too few images are no such doubt
+    ],
+)
+def test_where_all_views_fit_an_impossible_lens_every_way_is_tried(
+    tmp_path, monkeypatch, ways, tried, taken
+):
+    def of_way(focal, error):
+        found = model(focal or 250, 5 if focal else 2)
+        return replace(found, errors=np.full(9, error), track_lengths=np.full(9, 3))
+
+    models, jobs = {}, []
+
+    def map_in_turn(tries, at_once):
+        for k, attempt in enumerate(tries):
+            jobs.append(attempt.task)
+            folder = tmp_path / str(k)
+            folder.mkdir()
+            (folder / "focal").write_text(str(k))
+            models[folder] = of_way(*ways[k]) if k < len(ways) else of_way(60, 0.2)
+            yield [folder]
+
+    job = sfm.Job(str(tmp_path), [[]], [], 100.0, "match", keyframes=["00000.png"])
+    monkeypatch.setattr(reconstruct, "write_job", lambda *_: job)
+    monkeypatch.setattr(sfm, "run_in_turn", map_in_turn)
+    monkeypatch.setattr(reconstruct, "read_model", models.__getitem__)
+    earlier = EarlierRounds()
+    found, _ = best_model(views_of(5), tmp_path, 1, "sift", earlier=earlier)
+    assert found.cameras[1].K[0, 0] == taken
+    assert len(jobs) == tried
+    assert ways[int(earlier.model["focal"])][0] == taken

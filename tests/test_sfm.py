@@ -22,6 +22,7 @@ from hdr_nsff.priors.poses import sfm
 from hdr_nsff.priors.poses.colmap_matches import MIN_PAIRS_OF_PROCESS
 from hdr_nsff.priors.poses.reconstruct import attempts
 from hdr_nsff.priors.poses.rotation import focal_length
+from hdr_nsff.priors.poses.sfm_worker import LOST_PX, drop_lost_points, mean_error
 from hdr_nsff.priors.poses.trimming import TrimmingTuning
 from hdr_nsff.priors.poses.view_matches import EarlierRounds
 
@@ -210,3 +211,17 @@ def test_every_mapping_of_the_same_matches_gives_the_same_model(tmp_path, task):
     for key, image in alone.images.items():
         assert np.array_equal(image.c2w, other.images[key].c2w)
         assert not np.array_equal(image.c2w, one.images[key].c2w)
+
+
+def test_a_point_behind_a_camera_does_not_hide_the_error_of_the_others(tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    names, named = write_seen_points(tmp_path, 300.0, 320)
+    job = sfm.Job(str(tmp_path), [names], named, 277.0, "incremental")
+    ((folder,),) = sfm.run_in_turn([job], 1)
+    found = pycolmap.Reconstruction(folder)
+    error, count = mean_error(found), len(found.points3D)
+    next(iter(found.points3D.values())).xyz = np.array([0.0, 0.0, -1e3])
+    assert error < 1 and mean_error(found) > LOST_PX
+    drop_lost_points(found)
+    assert len(found.points3D) == count - 1
+    assert mean_error(found) == pytest.approx(error, rel=0.01)

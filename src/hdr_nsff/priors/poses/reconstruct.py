@@ -3,7 +3,9 @@
 pycolmap maps the views (`sfm.py`) incrementally, from the focal length of a usual lens
 and of a long one, then globally, with and without leveled contrast, until enough of
 them register with a focal length that a lens can have. Where the first way fails, the
-others are tried side by side.
+others are tried side by side. Where they all register with one that no lens has, as
+before a camera that flies straight ahead, every way is tried, and the one whose points
+fit best is taken.
 """
 
 from __future__ import annotations
@@ -182,10 +184,9 @@ def best_model(
     Matches and poses of `earlier` rounds, on the same views with other pixels ignored,
     are used again; this round's are added in place.
     """
-    count = len(views.images)
-    best: ColmapModel | None = None
+    search = Search(len(views.images), tuning)
     scale = upsampling_factor(views.images.shape[1:3], tuning.matching)
-    failures, tries_left = [], tuning.max_attempts
+    tries_left = tuning.max_attempts
     longer_side = scale * max(views.images.shape[1:3])
     long_focal = focal_length(tuning.long_lens_fov_degrees, longer_side)
     at_once = threads or usable_cores()
@@ -207,32 +208,73 @@ def best_model(
                 )  # fmt: skip
                 job = mapping.apply_to(job)
             except sfm.SfmError as error:
-                failures.append(str(error))
+                search.failures.append(str(error))
                 continue
             tries = attempts(job, earlier, long_focal)[:tries_left]
             results = stack.enter_context(closing(sfm.run_in_turn(tries, at_once)))
             for attempt, folders in zip(tries, results, strict=True):
                 tries_left -= 1
-                if isinstance(folders, sfm.SfmError):
-                    failures.append(str(folders))
-                    continue
-                models = [read_model(p) for p in folders]
-                candidates = models if best is None else [best, *models]
-                best = max(candidates, key=lambda m: model_rank(m, count, tuning), default=None)
-                if best is not None and model_rank(best, count, tuning)[:2] == (True, True):
-                    chosen = next(f for f, m in zip(folders, models, strict=True) if m is best)
-                    earlier.model = {p.name: p.read_bytes() for p in chosen.iterdir()}
-                    return best, scale
-                num_registered = 0 if best is None else len(best.images)
+                search.add(folders)
+                if search.is_over:
+                    break
                 say(
                     f"poses: {attempt.task} mapping ({contrast} contrast): "
-                    f"{num_registered} of {count} views registered at best so far"
+                    f"{search.num_registered} of {search.count} views registered at best so far"
                 )
+            if search.good:
+                model, files = search.chosen()
+                earlier.model = {p.name: p.read_bytes() for p in files.iterdir()}
+                return model, scale
+    best = search.best
     if best is None or not has_plausible_lens(best, tuning):
-        raise InputError(failure_message(best, views, failures, tuning))
-    if len(best.images) < tuning.min_registered * count:
-        raise InputError(failure_message(best, views, failures, tuning))
+        raise InputError(failure_message(best, views, search.failures, tuning))
+    if len(best.images) < tuning.min_registered * search.count:
+        raise InputError(failure_message(best, views, search.failures, tuning))
     return best, scale
+
+
+@dataclass
+class Search:
+    """What the ways to map `count` views have come to so far."""
+
+    count: int
+    tuning: ReconstructionTuning
+    best: ColmapModel | None = None
+    good: list[tuple[ColmapModel, Path]] = field(default_factory=list)  # with their files
+    in_doubt: bool = False  # all views fit a lens that no camera has
+    failures: list[str] = field(default_factory=list)
+
+    @property
+    def is_over(self) -> bool:
+        """Whether no other way needs to be tried."""
+        return bool(self.good) and not self.in_doubt
+
+    @property
+    def num_registered(self) -> int:
+        """The number of views in the best model."""
+        return 0 if self.best is None else len(self.best.images)
+
+    def add(self, folders: list[Path] | sfm.SfmError) -> None:
+        """The models in the `folders` of one way, or why it failed."""
+        if isinstance(folders, sfm.SfmError):
+            self.failures.append(str(folders))
+            return
+        for folder in folders:
+            model = read_model(folder)
+            rank = self.rank(model)
+            if self.best is None or rank > self.rank(self.best):
+                self.best = model
+            if rank[:2] == (True, True):
+                self.good.append((model, folder))
+            self.in_doubt |= rank[:2] == (False, True)
+
+    def rank(self, model: ColmapModel) -> tuple[bool, bool, int, int]:
+        """The order of models."""
+        return model_rank(model, self.count, self.tuning)
+
+    def chosen(self) -> tuple[ColmapModel, Path]:
+        """The good model whose points fit best."""
+        return min(self.good, key=lambda found: median_error(found[0], self.tuning))
 
 
 def attempts(job: sfm.Job, earlier: EarlierRounds, long_focal: float) -> list[sfm.Job]:
@@ -350,6 +392,14 @@ def model_rank(
     num_tracks = int((model.track_lengths >= tuning.min_track_views).sum())
     enough = num_images >= tuning.enough_registered * count
     return has_plausible_lens(model, tuning), enough, num_images, num_tracks
+
+
+def median_error(
+    model: ColmapModel, tuning: ReconstructionTuning = ReconstructionTuning()
+) -> float:
+    """The median reprojection error of the points with long tracks, in pixels."""
+    errors = model.errors[model.track_lengths >= tuning.min_track_views]
+    return float(np.median(errors)) if len(errors) else np.inf
 
 
 def failure_message(

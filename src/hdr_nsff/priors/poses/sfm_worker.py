@@ -37,6 +37,7 @@ from hdr_nsff.priors.poses.sfm_child import die_with_parent, send
 from hdr_nsff.priors.poses.trimming import NUM_PINHOLE_PARAMS, trim
 
 NEVER = 1e9  # growth of a model that it does not reach
+LOST_PX = 1e6  # COLMAP's error of a point behind a camera that sees it is far beyond
 
 
 def load_matches(job: Job, database: Path) -> None:
@@ -219,6 +220,7 @@ def adjust(model: Any, job: Job, final: bool) -> None:
     for options in (held, free):
         options.refine_extra_params = job.refine_distortion
     pycolmap.bundle_adjustment(model, held)
+    drop_lost_points(model)
     before = {key: list(camera.params) for key, camera in model.cameras.items()}
     held_error = mean_error(model)
     pycolmap.bundle_adjustment(model, free)
@@ -226,7 +228,18 @@ def adjust(model: Any, job: Job, final: bool) -> None:
         for key, params in before.items():
             model.cameras[key].params = params
         pycolmap.bundle_adjustment(model, held)
+    drop_lost_points(model)
     send("tick")
+
+
+def drop_lost_points(model: Any) -> None:
+    """Drop the points that an adjustment has left behind a camera, in place: a single
+    one would be all that a mean error shows.
+    """
+    model.update_point_3d_errors()
+    lost = [key for key, point in model.points3D.items() if point.error > LOST_PX]
+    for key in lost:
+        model.delete_point3D(key)
 
 
 def mean_error(model: Any) -> float:
