@@ -145,6 +145,12 @@ def test_a_correct_list_causes_no_warning_and_wrong_ones_do():
     assert "repeats every 3" in contradictions(video, [0.0] * 24)[0]
 
 
+def test_a_single_jump_of_a_list_is_no_alternation():
+    """As of auto exposure, which keeps the brightness where the light changes."""
+    assert contradictions(clip([0]), [0.0] * 12 + [0.5] * 12) == []
+    assert "repeats every 2" in contradictions(clip([0, 2]), [0.0] * 12 + [0.5] * 12)[0]
+
+
 def test_reference_is_the_best_exposed_bracket():
     assert reference_bracket(clip([-7, 0.5, 5]), [0, 1, 2] * 8) == 1
 

@@ -104,10 +104,22 @@ def test_little_drift_leaves_the_curve_alone(known):
     assert response.source == "one exposure"
     np.testing.assert_allclose(response.y[0, 0], response.x ** (1 / 2.2), atol=1e-9)
     assert "do not determine the response; single frames drift" in describe(response, [0.0])
+    assert bool(response.disagreement) == known
     if known:
         np.testing.assert_array_equal(response.drift, drift)
+        assert "the pixels disagree with given exposures" in describe(response, [0.0])
     else:
         assert np.abs(response.drift - drift + drift.mean()).max() < 0.25
+
+
+@pytest.mark.parametrize("curve", [SRGB, S_CURVE])
+def test_little_drift_that_is_given_agrees_through_an_assumed_curve(curve):
+    drift = smooth_drift(0.8)
+    views = drifting_views(curve, drift, (1,))
+    found = estimate_response(views, [0] * NUM, [0.0], 0, 1, drift=drift)
+    assert found.source == "one exposure" and not found.disagreement
+    found = estimate_response(views, [0] * NUM, [0.0], 0, 1, drift=-drift)
+    assert found.disagreement
 
 
 def test_pixels_that_disagree_with_a_given_drift_are_reported():
@@ -115,8 +127,17 @@ def test_pixels_that_disagree_with_a_given_drift_are_reported():
     wrong = smooth_drift(3.0).copy()
     wrong[5:8] += 1.0
     response = estimate_response(views, [0] * NUM, [0.0], 0, 1, drift=wrong)
-    assert "disagree" in response.problem
+    assert "disagree" in response.disagreement and not response.problem
+    assert response.disagreement in describe(response, [0.0])
     np.testing.assert_array_equal(response.drift, wrong)
+
+
+def test_a_given_drift_that_nothing_can_be_held_against_is_named():
+    drift = smooth_drift(3.0)
+    views = [replace(v, disparity=0 * v.disparity) for v in drifting_views(SRGB, drift, (1,))]
+    response = estimate_response(views, [0] * NUM, [0.0], 0, 1, drift=drift)
+    np.testing.assert_array_equal(response.drift, drift)
+    assert "too few static points to hold given exposures against" in describe(response, [0.0])
 
 
 def test_exposures_are_the_offsets_between_readings():

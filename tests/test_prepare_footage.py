@@ -119,6 +119,21 @@ def test_a_listed_alternation_with_drift_on_top_keeps_its_brackets(tmp_path: Pat
     np.testing.assert_allclose(np.diff(found), np.diff(ev), atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("recorded", "problem"),
+    [([0, -2], "go the way the brightness goes"), ([0], "about equally bright")],
+)
+def test_a_list_with_drift_that_the_brightness_contradicts_is_reported(
+    recorded: list[float], problem: str, tmp_path: Path
+) -> None:
+    ev = np.tile([-2.0, 0.0], 10) + np.linspace(-0.5, 0.5, 20)
+    rows = "".join(f"{t:03d}.png,{e}\n" for t, e in enumerate(ev))
+    (tmp_path / "clip").mkdir()
+    (tmp_path / "clip/exposures.csv").write_text(f"file,ev\n{rows}")
+    drift, doubt = exposure_step(work_on(tmp_path, clip(recorded, frames=20))).details["doubts"]
+    assert "drift" in drift and problem in doubt
+
+
 def test_the_exposures_of_synchronized_cameras_drift_from_brackets_of_their_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

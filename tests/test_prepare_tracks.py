@@ -64,6 +64,16 @@ def test_exposures_are_listed_one_per_track(config: PrepareConfig) -> None:
         prepare(replace(config, ev="1,-2,0"))
 
 
+def test_exposures_of_tracks_that_the_pixels_contradict_are_reported(
+    config: PrepareConfig,
+) -> None:
+    m = Manifest.load(prepare(replace(config, ev="-2,1")))
+    (doubt,) = m.steps["exposure"].details["doubts"]
+    assert "0% of the exposure steps go the way the brightness goes" in doubt
+    agreeing = prepare(replace(config, ev="1,-2", out=config.out.with_name("agreeing")))
+    assert Manifest.load(agreeing).steps["exposure"].details["doubts"] == []
+
+
 def test_a_csv_names_the_frames_of_tracks_with_their_folders(config: PrepareConfig) -> None:
     rows = [f"{name}/{t:03d}.png,{ev}" for name, ev in EVS.items() for t in range(COUNT)]
     text = "\n".join(["file,ev", *rows])

@@ -94,12 +94,21 @@ def exposures_by(
     many = len(exposure.brackets_by_ev(given)[1]) > exposure.MAX_CYCLE
     if source == GOPRO or (many and len(cameras) == 1):
         own = own_brackets(work, given) if gapped is None else gapped.cycle.brackets
-        return drifting_exposures(source, given, own)
+        found = drifting_exposures(source, given, own)
+        return replace(found, notes=(*found.notes, *contradictions(work, cameras, given)))
     brackets, known = exposure.brackets_by_ev(given)
-    doubts = []
-    for own in cameras:
-        doubts += exposure.contradictions(work.video[own], [given[i] for i in own])
+    doubts = contradictions(work, cameras, given)
     return FrameExposures(source, brackets, [*known], True, False, notes=tuple(doubts))
+
+
+def contradictions(work: Work, lines: list[list[int]], given: list[float]) -> list[str]:
+    """What the brightness of frames contradicts in the `given` EV of all of them, in
+    sentences; `lines` are the indices of frames that follow each other.
+    """
+    found = []
+    for own in lines:
+        found += exposure.contradictions(work.video[own], [given[i] for i in own])
+    return found
 
 
 def cycle_with_gaps(work: Work, given: list[float] | None) -> GappedCycle | None:
@@ -164,10 +173,20 @@ def track_exposures(work: Work, source: str, given: list[float] | None) -> Frame
     if given is None:
         unknown: list[float | None] = [None] * (max(brackets) + 1)
         return FrameExposures(source, brackets, unknown, False, True)
-    known, drift = levels_and_drift(given, brackets)
+    levels, drift = levels_and_drift(given, brackets)
     drifts = np.ptp(drift) > MIN_DRIFT_EV
+    # frames of one time, one track after the other, show the step between tracks
+    frames = work.manifest.frames
+    side_by_side = sorted(range(len(frames)), key=lambda i: (frames[i].time, frames[i].track))
+    notes = contradictions(work, [side_by_side], given)
     return FrameExposures(
-        source, brackets, [*known], True, False, drift=tuple(drift.tolist()) if drifts else ()
+        source,
+        brackets,
+        [*levels],
+        True,
+        False,
+        notes=tuple(notes),
+        drift=tuple(drift.tolist()) if drifts else (),
     )
 
 

@@ -36,6 +36,9 @@ from hdr_nsff.radiometry.static_samples import ResponseView
 TUNING = ResponseTuning()
 LEVEL_EV = 0.4  # frames this close in exposure count as one where noise is measured
 DRIFTING_SHARE = 0.95  # quantile of the frames that has to drift for any to count
+# by which the slope of a camera's curve may differ from that of gamma 2.2 (hand-chosen)
+MAX_CURVE_FACTOR = 1.5
+UNCHECKED = "too few static points to hold given exposures against the pixels"
 CHANGING_LIGHT = "light that changes in some brackets only is not taken for auto exposure"
 
 
@@ -84,20 +87,18 @@ def with_given_drift(
     in_time = [views[i] for i in ordered]
     readings = read_points(in_time, np.random.default_rng(SEED), tuning.frames)
     if not is_determined(readings, len(views), tuning.frames):
-        return response
+        return replace(response, disagreement=UNCHECKED)
     exposures = np.array([float(ev[v.bracket] or 0.0) for v in in_time]) + drift[ordered]
+    brackets = np.array([v.bracket for v in in_time])
     if np.ptp(exposures) < tuning.min_range:
-        return response
+        seen = frame_log_exposures(readings, response.x, response.y[0], brackets, tuning.frames)
+        assumed = response.source != "static points"
+        return replace(response, disagreement=disagreement(seen, exposures, tuning, assumed))
     samples = replace(readings.samples, offset=exposures[readings.frame])
     fit = debevec(samples, [0.0] * readings.frame.shape[1], 0, tuning.debevec)
     if problem := problem_of(fit.x, fit.y, fit.misfit, tuning):
         return replace(response, problem=problem)
-    brackets = np.array([v.bracket for v in in_time])
     seen = frame_log_exposures(readings, fit.x, fit.y, brackets, tuning.frames)
-    off = np.abs(seen - seen.mean() - exposures + exposures.mean())
-    problem = ""
-    if np.quantile(off, DRIFTING_SHARE) > tuning.frames.min_drift:
-        problem = f"the pixels disagree with given exposures by up to {off.max():.2f} EV"
     return replace(
         response,
         x=fit.x,
@@ -106,8 +107,26 @@ def with_given_drift(
         misfit=fit.misfit,
         num_points=len(readings.frame),
         guessed=False,
-        problem=problem,
+        problem="",
+        disagreement=disagreement(seen, exposures, tuning),
     )
+
+
+def disagreement(
+    seen: np.ndarray, given: np.ndarray, tuning: ResponseTuning, assumed: bool = False
+) -> str:
+    """By how much `seen` log2 exposures (T,) of frames differ from `given` ones, in
+    words; "" where hardly. An `assumed` curve stretches what is seen by a factor.
+    """
+    seen, given = seen - seen.mean(), given - given.mean()
+    factor = 1.0
+    if assumed:
+        best = float(seen @ given) / max(float(given @ given), 1e-9)
+        factor = float(np.clip(best, 1 / MAX_CURVE_FACTOR, MAX_CURVE_FACTOR))
+    off = np.abs(seen - factor * given)
+    if np.quantile(off, DRIFTING_SHARE) < tuning.frames.min_drift:
+        return ""
+    return f"the pixels disagree with given exposures by up to {off.max():.2f} EV"
 
 
 def with_drift(

@@ -44,6 +44,7 @@ class ExposureCycleTuning:
     # a list of exposures is questioned when fewer of its steps have the sign of the
     # measured ones, or when it is off by more than this factor
     min_same_sign: float = 0.8
+    min_alternating: float = 0.25  # share of given steps; fewer are no alternation
     max_ev_ratio: float = 2.0
     well_exposed_low: float = 0.05  # recorded value, for the choice of the reference
     # share of the darkest pixels that is the black of a camera with a pedestal
@@ -224,7 +225,7 @@ def contradictions(
     measured = brightness_steps(video, tuning)
     given = np.diff(ev)
     alternates = np.abs(given) >= tuning.min_step_ev
-    if not alternates.any():
+    if alternates.mean() < tuning.min_alternating:
         length = detect_cycle(video, tuning).length
         if length == 1:
             return []
@@ -232,9 +233,9 @@ def contradictions(
             "the given exposures do not alternate, but the brightness repeats every "
             f"{length} frames"
         ]
-    if np.abs(measured).mean() < tuning.min_step_ev:
+    if np.abs(measured[alternates]).mean() < tuning.min_step_ev:
         return [
-            f"exposure steps of {np.abs(given).mean():.1f} EV are given, "
+            f"exposure steps of {np.abs(given[alternates]).mean():.1f} EV are given, "
             "but all frames are about equally bright"
         ]
     same_sign = np.mean(np.sign(measured[alternates]) == np.sign(given[alternates]))

@@ -33,6 +33,8 @@ class Response:
     guessed: bool  # the common factor of all `ev` is the likeliest one, not measured
     own_curves: tuple[int, ...]  # cameras with a curve of their own, of several cameras
     problem: str = ""  # why not from static points, in words
+    # what pixels say against given exposures of frames, in words; not stored
+    disagreement: str = ""
     # where no exposure was known: the common factor that would turn all `ev` into what
     # the recordings alone say, and its 95 % interval; else 1
     measured_scale: float = 1.0

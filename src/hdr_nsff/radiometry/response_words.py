@@ -11,6 +11,14 @@ from hdr_nsff.radiometry.response import Response
 
 def describe(response: Response, given_ev: Sequence[float | None]) -> str:
     """How the response was found, in one sentence."""
+    text = describe_source(response, given_ev)
+    if response.disagreement:
+        text += f"; {response.disagreement}"
+    return text
+
+
+def describe_source(response: Response, given_ev: Sequence[float | None]) -> str:
+    """The same, without what given exposures and pixels disagree in."""
     steps = ", ".join(f"{e:+.2f}" for e in response.ev)
     match response.source:
         case "one exposure":
