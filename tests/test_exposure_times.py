@@ -84,6 +84,23 @@ def test_times_come_from_where_exposures_come_from(
     assert found == pytest.approx(found[:2] * (FRAMES // 2))
 
 
+def test_metadata_of_one_exposure_are_said_to_leave_it_to_the_brightness(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    m = prepared(tmp_path, stills(tmp_path / "clip", [0.01] * FRAMES))
+    printed = " ".join(capsys.readouterr().err.split())
+    assert "EXIF gives all frames one exposure; brightness decides instead" in printed
+    assert m.cycle == 2 and not m.exposure_given
+
+
+def test_a_small_drift_in_exif_is_a_drift(tmp_path: Path) -> None:
+    seconds = np.linspace(0.01, 0.011, FRAMES)  # 0.14 EV
+    m = prepared(tmp_path, stills(tmp_path / "clip", seconds.tolist()))
+    assert m.exposure_given and m.bracket_ev == [0.0]
+    expected = np.log2(seconds) - np.log2(seconds).mean()
+    np.testing.assert_allclose([f.drift for f in m.frames], expected, atol=1e-3)
+
+
 def test_metadata_that_the_brightness_refutes_have_no_times(tmp_path: Path) -> None:
     """As in stills of a video that all have the EXIF of the camera."""
     footage = stills(tmp_path / "clip", [0.01] * FRAMES)

@@ -8,6 +8,7 @@ import numpy as np
 
 from hdr_nsff.footage.exposure_lists import ev_in_list, read_exif_ev, read_exposure_csv
 from hdr_nsff.footage.footage import Footage
+from hdr_nsff.prepare.exposures import EXIF, MIN_DRIFT_EV
 from hdr_nsff.radiometry import exposure_cycle as exposure
 from hdr_nsff.radiometry.dropped_frames import find_cycle
 
@@ -16,12 +17,16 @@ from hdr_nsff.radiometry.dropped_frames import find_cycle
 class GivenExposures:
     """Where the exposures of frames are written down, and what they are."""
 
-    source: str  # exposures.csv or EXIF
+    source: str  # the name of a list, or `EXIF`
     ev: list[float]  # (T,) to any reference
 
     @property
     def follows_no_cycle(self) -> bool:
-        """Whether they are too many for a cycle: auto exposure."""
+        """Whether they are too many for a cycle, or metadata of less than a step: auto
+        exposure.
+        """
+        if self.source == EXIF and max(self.ev) - min(self.ev) < exposure.MIN_STEP:
+            return True
         return len(exposure.brackets_by_ev(self.ev)[1]) > exposure.MAX_CYCLE
 
     def cycle(self) -> tuple[exposure.Cycle, tuple[int, ...]]:
@@ -71,6 +76,6 @@ def given_exposures(footage: Footage, count: int) -> GivenExposures | None:
         return None
     written = [read_exif_ev(path) for path in footage.cameras[0][:count]]
     found = [ev for ev in written if ev is not None]
-    if len(found) < count or max(found) - min(found) < exposure.MIN_STEP:
+    if len(found) < count or max(found) - min(found) < MIN_DRIFT_EV:
         return None
-    return GivenExposures("EXIF", found)
+    return GivenExposures(EXIF, found)

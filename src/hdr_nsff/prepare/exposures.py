@@ -31,8 +31,8 @@ from hdr_nsff.radiometry.dropped_frames import GappedCycle, find_cycle
 
 # confidence of a cycle by brightness from which it refutes a list (hand-chosen)
 MIN_CONFIDENCE = 0.8
-GOPRO = "GoPro's metadata"  # as a source of exposures
-MIN_DRIFT_EV = 0.02  # of such exposures; below it, they are one
+GOPRO, EXIF = "GoPro's metadata", "EXIF"  # as sources of exposures
+MIN_DRIFT_EV = 0.02  # of these; below it, they are one
 MAX_LISTED = 5  # frames in a message
 FRAMES_OF_START = 4 * exposure.MAX_CYCLE  # in which a cycle shows, none left out
 
@@ -92,7 +92,8 @@ def exposures_by(
         notes = cycle_notes(work, cycles, group)
         return FrameExposures(source, brackets, unknown, False, True, notes=tuple(notes))
     many = len(exposure.brackets_by_ev(given)[1]) > exposure.MAX_CYCLE
-    if source == GOPRO or (many and len(cameras) == 1):
+    drifts = source in (GOPRO, EXIF) and max(given) - min(given) < exposure.MIN_STEP
+    if source == GOPRO or drifts or (many and len(cameras) == 1):
         own = own_brackets(work, given) if gapped is None else gapped.cycle.brackets
         found = drifting_exposures(source, given, own)
         return replace(found, notes=(*found.notes, *contradictions(work, cameras, given)))
@@ -261,12 +262,15 @@ def given_exposures(work: Work) -> tuple[str, list[float] | None]:
             for f, n in zip(frames, numbers, strict=True)
         ]
     if work.footage.video:
-        source, known, least_change = GOPRO, gopro_exposures(work), MIN_DRIFT_EV
+        source, known = GOPRO, gopro_exposures(work)
     else:
-        source, known, least_change = "EXIF", exif_exposures(work), exposure.MIN_STEP
-    if len(known) == len(frames) and max(known) - min(known) >= least_change:
-        return source, known
-    return "brightness", None
+        source, known = EXIF, exif_exposures(work)
+    if len(known) < len(frames):
+        return "brightness", None
+    if max(known) - min(known) < MIN_DRIFT_EV:
+        say(f"exposure: {source} gives all frames one exposure; brightness decides instead")
+        return "brightness", None
+    return source, known
 
 
 def gopro_exposures(work: Work) -> list[float]:
