@@ -10,6 +10,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,10 +21,14 @@ from test_export_gaussians import make_run
 from hdr_nsff.core.checkpoints import pack, save_checkpoint
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.rendering import row_bands
+from hdr_nsff.rendering import served_run as module
+from hdr_nsff.rendering.row_bands import render_in_bands
 from hdr_nsff.rendering.served_run import ServedRun
+from hdr_nsff.rendering.stills import Still
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.build import tone_mapper_for
 from hdr_nsff.training.run_folder import Run, write_config
+from hdr_nsff.viewer import display
 from hdr_nsff.viewer.scene_file import from_bytes
 from hdr_nsff.viewer.server import FrameRequest
 
@@ -57,6 +62,9 @@ def request_of(toy: Scene, **change: object) -> FrameRequest:
         curve="camera",
         camera_id=0,
         show="radiance",
+        clipping=False,
+        false_color=False,
+        kind="jpeg",
     )
     return replace(request, **change)  # type: ignore[arg-type]
 
@@ -68,9 +76,9 @@ def frame(served: ServedRun, request: FrameRequest) -> bytes:
     return found
 
 
-def decode(jpeg: bytes) -> np.ndarray:
-    bgr = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
-    return bgr[..., ::-1] / 255
+def decode(file: bytes) -> np.ndarray:
+    bgr = cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_UNCHANGED)
+    return bgr[..., ::-1] / np.iinfo(bgr.dtype).max
 
 
 @pytest.mark.parametrize("preset", ["splat", "grid", "paper"])
@@ -84,8 +92,50 @@ def test_a_frame_is_what_the_camera_would_record(
     expected = run.tonemapper.develop(radiance, 0.0).view(camera.height, camera.width, 3)
     found = decode(frame(served, request_of(toy)))
     assert np.abs(found - expected.numpy()).mean() < 0.06  # noise, as a JPEG
-    for change in ({"curve": "clip"}, {"curve": "reinhard"}, {"show": "depth"}, {"show": "motion"}):
-        assert decode(frame(served, request_of(toy, **change))).shape == found.shape
+    for show in ("depth", "motion", "flow"):
+        assert decode(frame(served, request_of(toy, show=show))).shape == found.shape
+
+
+def test_radiance_is_shown_as_by_a_page_that_draws(
+    toy: Scene, toy_folder: Path, tmp_path: Path
+) -> None:
+    run = save_run(toy, toy_folder, tmp_path / "run", "grid")
+    served = ServedRun(tmp_path / "run", "cpu")
+    camera = toy.train[0].camera
+    radiance = run.field.render(camera, 1.0, scene_flow=False).radiance.numpy()
+    light = radiance.reshape(camera.height, camera.width, 3) * run.tonemapper.neutral(0).numpy()
+    for curve in ("agx", "neutral", "reinhard", "clip"):
+        expected = display.develop(2 * light, curve)
+        request = request_of(toy, curve=curve, ev=1.0, kind="png16")
+        np.testing.assert_allclose(decode(frame(served, request)), expected, atol=2e-5)
+    request = request_of(toy, curve="clip", ev=3.0, clipping=True, kind="png8")
+    marked = display.mark_clipping(display.develop(8 * light, "clip"))
+    np.testing.assert_allclose(decode(frame(served, request)), marked, atol=0.51 / 255)
+    request = request_of(toy, curve="clip", false_color=True, kind="png8")
+    shown = decode(frame(served, request))
+    np.testing.assert_allclose(shown, display.false_color(light), atol=0.51 / 255)
+
+
+def test_a_view_is_rendered_once_for_all_of_its_looks(
+    toy: Scene, toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = save_run(toy, toy_folder, tmp_path / "run", "grid")
+    served = ServedRun(tmp_path / "run", "cpu")
+    rendered: list[float] = []
+
+    def counted(*arguments: Any) -> Still | None:
+        rendered.append(arguments[1].time)
+        return render_in_bands(*arguments)
+
+    monkeypatch.setattr(module, "render_in_bands", counted)
+    for change in ({}, {"ev": 2.0}, {"curve": "agx"}, {"show": "depth"}, {"kind": "png8"}):
+        frame(served, request_of(toy, **change))
+    assert rendered == [1.0]
+    frame(served, request_of(toy, time=2.0))
+    save_step(run, 9)
+    served.version()
+    frame(served, request_of(toy, time=2.0))
+    assert rendered == [1.0, 2.0, 2.0]
 
 
 @pytest.mark.parametrize("preset", ["hdr-hexplane", "nerf-wt"])
@@ -96,6 +146,9 @@ def test_fields_that_record_by_themselves_are_served(
     served = ServedRun(tmp_path / "run", "cpu")
     found = decode(frame(served, request_of(toy, ev=-1.0)))
     assert found.shape == (toy.train[0].camera.height, toy.train[0].camera.width, 3)
+    assert '"records": true' in served.page()
+    with pytest.raises(InputError, match="This field has no scene flow"):
+        frame(served, request_of(toy, show="flow"))
 
 
 def test_a_frame_is_given_up_between_two_bands(
@@ -105,7 +158,9 @@ def test_a_frame_is_given_up_between_two_bands(
     served = ServedRun(tmp_path / "run", "cpu")
     whole = decode(frame(served, request_of(toy)))
     monkeypatch.setattr(row_bands, "BAND_PIXELS", 5 * toy.train[0].camera.width + 1)
+    served.kept = None
     np.testing.assert_array_equal(decode(frame(served, request_of(toy))), whole)
+    served.kept = None
     answers = iter([True, True, False])
     assert served.frame(request_of(toy), lambda: next(answers)) is None
     assert next(answers, None) is None  # asked no more

@@ -24,6 +24,9 @@ REQUEST = {
     "curve": "camera",
     "camera": 0,
     "show": "radiance",
+    "clipping": False,
+    "falseColor": False,
+    "kind": "jpeg",
 }
 SLOW = 3.0  # the time of a frame that is rendered as long as it is awaited
 
@@ -169,8 +172,11 @@ def test_videos_are_served_whole_or_in_part(
         ({"width": 100_000, "height": 100_000}, "at most 4,000,000"),
         ({"height": 0}, "48 x 0 pixels"),
         ({"ev": 1000}, "beyond 60 stops"),
-        ({"curve": "agx"}, "curve must be one of"),
+        ({"curve": "round"}, "curve must be one of"),
         ({"show": None}, "show must be one of"),
+        ({"kind": "gif"}, "kind must be one of jpeg, png8, png16"),
+        ({"clipping": 1}, "clipping must be true or false"),
+        ({"falseColor": "no"}, "falseColor must be true or false"),
         ({"c2w": [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}, "not a rotation"),
         ({"K": [[0, 0, 0], [0, 1, 0], [0, 0, 1]]}, "K must be"),
     ],

@@ -5,6 +5,7 @@ Chromium.
 
 from __future__ import annotations
 
+import base64
 import json
 import threading
 import time
@@ -12,17 +13,19 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from queue import Queue
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from browser import Page, find_browser
 from test_served_run import save_run, save_step
-from viewer_tab import state
+from viewer_tab import png_text, state
 
 from hdr_nsff.rendering.served_run import ServedRun
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.viewer.server import MAX_PIXELS, FrameRequest, ViewerServer
 
+NO_WEBGL = "HTMLCanvasElement.prototype.getContext = () => null;"
 SENT = "Network.requestWillBeSent"
 
 if find_browser() is None:
@@ -59,9 +62,50 @@ def test_a_browser_without_a_gpu_shows_frames_of_the_server(tab: Page, address: 
     tab.wait("!viewer.frames.busy && viewer.frames.shown > 2")
     width = tab.run("document.getElementById('frame').naturalWidth")
     assert width == tab.run("viewer.scene.width")  # the finest, after coarse ones
-    assert tab.run("document.querySelector('#curve [value^=agx]').disabled") is True
     assert all(asked.startswith(address) for asked in tab.requests())
     assert tab.problems() == []
+
+
+@pytest.mark.parametrize("address", ["grid"], indirect=True)
+def test_every_look_is_one_of_the_frames_that_the_server_keeps(tab: Page, address: str) -> None:
+    with tab.prepared(NO_WEBGL):
+        tab.goto(address, 500, 300)
+    tab.wait("!viewer.frames.busy && viewer.frames.shown > 0")
+    tab.events.clear()
+    looks = [{"ev": 2}, {"clipping": True}, {"falseColor": True}, {"show": "depth"}]
+    curves = [{"curve": curve} for curve in ("agx", "neutral", "clip", "camera", "reinhard")]
+    for look in [*curves, *looks]:
+        tab.run(f"globalThis.before = viewer.frames.shown; viewer.set({json.dumps(look)})")
+        tab.wait("viewer.frames.shown > before && !viewer.frames.busy")
+    width = tab.run("viewer.scene.width")
+    assert asked_widths(tab) == [width] * 9  # none is coarse: nothing is rendered
+    assert tab.run("document.querySelectorAll('#panel :disabled').length") == 0
+    assert tab.problems() == []
+
+
+@pytest.mark.parametrize("address", ["nerf-wt"], indirect=True)
+def test_a_field_that_records_itself_begins_coarse_at_another_exposure(
+    tab: Page, address: str
+) -> None:
+    tab.goto(address, 500, 300)
+    tab.run("viewer.set({curve: 'camera'})")
+    tab.wait("!viewer.frames.busy && viewer.frames.shown > 1")
+    tab.events.clear()
+    tab.run("viewer.frames.rate = 0; globalThis.before = viewer.frames.shown")
+    tab.run("viewer.set({ev: 1})")
+    tab.wait("!viewer.frames.busy && viewer.frames.shown > before")
+    first, *_, last = asked_widths(tab)
+    assert first < last == tab.run("viewer.scene.width")
+
+
+@pytest.mark.parametrize("address", ["grid"], indirect=True)
+def test_frames_of_the_server_are_saved_with_8_or_16_bits(tab: Page, address: str) -> None:
+    tab.goto(address, 500, 300)
+    width, height = tab.run("[viewer.scene.width, viewer.scene.height]")
+    for bits, kind in ((8, np.uint8), (16, np.uint16)):
+        file = np.frombuffer(base64.b64decode(tab.run(png_text(bits))), np.uint8)
+        picture = cv2.imdecode(file, cv2.IMREAD_UNCHANGED)
+        assert picture.dtype == kind and picture.shape == (height, width, 3)
 
 
 def test_frames_of_the_server_are_never_too_large(tab: Page, address: str) -> None:

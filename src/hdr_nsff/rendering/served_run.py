@@ -9,30 +9,28 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from hdr_nsff.core.checkpoints import checkpoint_files
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.images import colorize
 from hdr_nsff.core.progress import say
+from hdr_nsff.fields.recording_field import RecordingField
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.geometry.paths import PathView
-from hdr_nsff.maths import color
-from hdr_nsff.rendering.develop import develop_view
 from hdr_nsff.rendering.export_page import HDR_CLIP, VIDEOS, find_hdr_clip, run_scene
 from hdr_nsff.rendering.output import render_folders
 from hdr_nsff.rendering.row_bands import render_in_bands
+from hdr_nsff.rendering.served_picture import served_picture
 from hdr_nsff.rendering.shot_views import check_views
 from hdr_nsff.rendering.stills import Still
 from hdr_nsff.training.run_folder import Run
+from hdr_nsff.viewer.display import png
 from hdr_nsff.viewer.field_scene import jpeg
 from hdr_nsff.viewer.page_file import Link, PageSettings, make_page
 from hdr_nsff.viewer.scene_file import to_bytes
 from hdr_nsff.viewer.server import FrameRequest
 
-MOTION_COLOR = (1.0, 0.62, 0.15)  # of moving content, as on the page
-STILL_COLOR = 0.07
+BITS = {"png8": 8, "png16": 16}
 
 
 class ServedRun:
@@ -48,6 +46,7 @@ class ServedRun:
         newest = newest_checkpoint(self.folder)
         self.run = Run.open(self.folder, self.device)
         self.opened = newest
+        self.kept: tuple[bytes, Still] | None = None  # the last rendered view, by its key
         scene = run_scene(self.run)
         self.title, self.data = scene.title, to_bytes(scene)
 
@@ -60,7 +59,9 @@ class ServedRun:
         ]
         clip = self.hdr_clip()
         link = None if clip is None else Link(names[clip.name], HDR_CLIP)
-        return make_page(self.title, None, PageSettings(videos, link, server=True))
+        records = isinstance(self.run.field, RecordingField)
+        settings = PageSettings(videos, link, server=True, records=records)
+        return make_page(self.title, None, settings)
 
     def places(self) -> list[Path]:
         """Folders where the run's videos may be."""
@@ -92,8 +93,21 @@ class ServedRun:
         with self.lock:
             view = self.view_of(request)
             check_views(self.run, "frame", [view])
-            still = render_in_bands(self.run, view, False, awaited)
-            return None if still is None else jpeg(self.picture(request, view, still))
+            still = self.still_of(view, request.show == "flow", awaited)
+            if still is None:
+                return None
+            rgb = served_picture(self.run, request, view, still)
+        return jpeg(rgb) if request.kind == "jpeg" else png(rgb, BITS[request.kind])
+
+    def still_of(self, view: PathView, motion: bool, awaited: Callable[[], bool]) -> Still | None:
+        """The rendered view. The last one is kept, to be developed in other ways."""
+        key = view_key(view, motion)
+        if self.kept is None or self.kept[0] != key:
+            still = render_in_bands(self.run, view, motion, awaited)
+            if still is None:
+                return None
+            self.kept = key, still
+        return self.kept[1]
 
     def view_of(self, request: FrameRequest) -> PathView:
         """The view that a request asks for."""
@@ -102,30 +116,13 @@ class ServedRun:
         c2w = torch.from_numpy(request.c2w).to(like.c2w)
         return PathView(Camera(K, c2w, request.width, request.height), request.time)
 
-    def picture(self, request: FrameRequest, view: PathView, still: Still) -> np.ndarray:
-        """What a request shows of a rendered view: rgb (H, W, 3) in [0, 1]."""
-        near, far = self.run.scene.near, self.run.scene.far
-        match request.show:
-            case "depth":
-                disparity = 1 / np.clip(still.depth, near, far)
-                return colorize(disparity, 1 / far, 1 / near)
-            case "motion":
-                share = still.motion[..., None].clip(0, 1)
-                return STILL_COLOR + share * (np.array(MOTION_COLOR) - STILL_COLOR)
-        return self.develop(request, view, still.radiance)
 
-    def develop(self, request: FrameRequest, view: PathView, radiance: np.ndarray) -> np.ndarray:
-        """Radiance (H, W, 3) of a view through the curve of a request."""
-        camera_id, exposure = request.camera_id, 2.0**request.ev
-        if not 0 <= camera_id < self.run.tonemapper.num_cameras:
-            raise InputError(f"frame: camera {camera_id} is not known")
-        match request.curve:
-            case "camera":
-                return develop_view(self.run, view, radiance, request.ev, camera_id, 1.0)
-            case "clip":
-                neutral = self.run.tonemapper.neutral(camera_id).detach().cpu().numpy()
-                return color.srgb_encode(radiance * neutral * exposure)
-        return develop_view(self.run, view, radiance, None, camera_id, exposure)
+def view_key(view: PathView, motion: bool) -> bytes:
+    """What a rendering of a view depends on."""
+    camera = view.camera
+    numbers = [view.time, float(motion), camera.width, camera.height]
+    parts = [torch.tensor(numbers, dtype=torch.float64), camera.K, camera.c2w]
+    return b"".join(part.cpu().numpy().tobytes() for part in parts)
 
 
 def newest_checkpoint(folder: Path) -> str:

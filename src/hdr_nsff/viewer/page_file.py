@@ -49,6 +49,10 @@ class PageSettings:
     """An HDR video, for screens whose browser draws no light above white."""
     server: bool = False
     """The page comes from a server, which has the scene and renders frames."""
+    records: bool = False
+    """The field records by itself what the learned camera does: another exposure takes
+    the server as long as another view.
+    """
     max_pixels: int = MAX_PIXELS
 
 

@@ -27,8 +27,9 @@ HOST = "127.0.0.1"
 MAX_REQUEST_BYTES = 10_000
 NUM_PORTS = 2**16
 MAX_EV = 60.0  # stops: beyond this float32 radiance is 0 or Inf
-CURVES = ("camera", "reinhard", "clip")  # that this machine develops frames with
-VIEWS = ("radiance", "depth", "motion")  # that it renders
+CURVES = ("camera", "agx", "neutral", "reinhard", "clip")  # that develop radiance
+VIEWS = ("radiance", "depth", "motion", "flow")
+KINDS = {"jpeg": "image/jpeg", "png8": "image/png", "png16": "image/png"}  # of files
 LENGTH = re.compile(r"\d{1,9}")  # of a request in bytes
 RANGE = re.compile(r"bytes=(\d{1,18})-(\d{0,18})")  # of a file, as players ask for it
 
@@ -46,6 +47,9 @@ class FrameRequest:
     curve: str  # one of CURVES
     camera_id: int  # whose response develops the frame
     show: str  # one of VIEWS
+    clipping: bool  # whether clipped pixels are marked
+    false_color: bool  # whether radiance is shown as stops from mid gray
+    kind: str  # one of KINDS
 
 
 class Source(Protocol):
@@ -68,7 +72,7 @@ class Source(Protocol):
         ...
 
     def frame(self, request: FrameRequest, awaited: Callable[[], bool]) -> bytes | None:
-        """A rendered frame as a JPEG file. InputError where it cannot be rendered.
+        """A rendered frame as a file. InputError where it cannot be rendered.
 
         None where the frame is not `awaited` any more.
         """
@@ -128,7 +132,7 @@ class Handler(BaseHTTPRequestHandler):
             self.answer(HTTPStatus.BAD_REQUEST, "text/plain; charset=utf-8", str(error).encode())
             return
         if frame is not None:
-            self.answer(HTTPStatus.OK, "image/jpeg", frame)
+            self.answer(HTTPStatus.OK, KINDS[request.kind], frame)
 
     def read_body(self) -> bytes:
         """What was sent. InputError where its length is not given, or too large."""
@@ -221,9 +225,12 @@ def parse_request(data: bytes) -> FrameRequest:
     ev = number(entries, "ev")
     if abs(ev) > MAX_EV:
         raise InputError(f"frame: ev {ev:g} is beyond {MAX_EV:g} stops")
-    for name, known in (("curve", CURVES), ("show", VIEWS)):
+    for name, known in (("curve", CURVES), ("show", VIEWS), ("kind", tuple(KINDS))):
         if entries.get(name) not in known:
             raise InputError(f"frame: {name} must be one of {', '.join(known)}")
+    for name in ("clipping", "falseColor"):
+        if not isinstance(entries.get(name), bool):
+            raise InputError(f"frame: {name} must be true or false")
     return FrameRequest(
         time=number(entries, "time"),
         c2w=parse_pose(entries.get("c2w"), "frame"),
@@ -234,6 +241,9 @@ def parse_request(data: bytes) -> FrameRequest:
         curve=entries["curve"],
         camera_id=round(number(entries, "camera")),
         show=entries["show"],
+        clipping=entries["clipping"],
+        false_color=entries["falseColor"],
+        kind=entries["kind"],
     )
 
 

@@ -2,7 +2,6 @@
 
 import { CURVES, EXTENDED } from "./curves.js";
 import { MODES, followed } from "./cameras.js";
-import { SERVER_CURVES, SERVER_VIEWS } from "./frames.js";
 import { VIEWS } from "./renderer.js";
 
 const NO_PARALLAX = {
@@ -46,15 +45,6 @@ export function connectControls(player) {
   refresh();
 }
 
-/** Leave what frames of a server can show. */
-export function limitControls() {
-  for (const option of find("curve").options) {
-    option.disabled = !SERVER_CURVES.includes(option.value.split(" ")[0]);
-  }
-  for (const option of find("show").options) option.disabled = !SERVER_VIEWS.includes(option.value);
-  for (const id of ["clipping", "false-color", "save-8", "save-16"]) find(id).disabled = true;
-}
-
 /** Offer the curve of HDR screens, and take it, while the window is on such a screen. */
 export function offerExtended(player) {
   const label = CURVES.find(({ id }) => id === EXTENDED).label;
@@ -67,6 +57,12 @@ export function offerExtended(player) {
   find("curve").add(option, 0);
   player.hdr.watch(refresh);
   refresh();
+}
+
+/** Frames of a server end at white. */
+export function withdrawExtended(player) {
+  find("curve").querySelector(`[value^="${EXTENDED}"]`)?.remove();
+  if (player.state.curve === EXTENDED) player.set({ curve: "reinhard" });
 }
 
 /** A message that goes away after some seconds; 0: it stays. */
@@ -225,7 +221,7 @@ function connectKeyboard(player) {
       Home: () => player.set({ time: player.first }),
       End: () => player.set({ time: player.last }),
       "?": () => find("help").showModal(),
-      v: () => player.set({ show: after(player.frames ? SERVER_VIEWS : VIEWS, state.show) }),
+      v: () => player.set({ show: after(VIEWS, state.show) }),
       c: () => player.set({ curve: after(offeredCurves(), state.curve) }),
       x: () => player.set({ split: !state.split }),
       r: () => player.resetCamera(),
@@ -324,7 +320,7 @@ function copyBySelection(text) {
 async function savePng(player, bits) {
   const { time } = player.state; // playback goes on while the file is made
   const picture = await player.png(bits);
-  if (!picture) return note("Pictures can be saved where the browser draws them.");
+  if (!picture) return; // a note says why
   const link = document.createElement("a");
   link.href = URL.createObjectURL(picture);
   const signal = bits === 16 && player.isBeyondWhite() ? "_pq" : "";

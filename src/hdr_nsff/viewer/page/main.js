@@ -5,8 +5,8 @@ import { Renderer, driverName, openContext } from "./renderer.js";
 import { offerClip } from "./clip.js";
 import { hasHighRange, openHdrScreen } from "./hdr.js";
 import { Player } from "./player.js";
-import { Frames, SERVER_CURVES, SERVER_VIEWS } from "./frames.js";
-import { connectControls, find, limitControls, note, offerExtended } from "./controls.js";
+import { Frames } from "./frames.js";
+import { connectControls, find, note, offerExtended, withdrawExtended } from "./controls.js";
 
 const WORKER = "sorter.js";
 const FOLLOW_MILLISECONDS = 5000; // between two looks at the version of the scene
@@ -92,21 +92,14 @@ function shaderSources() {
 }
 
 /** From now on, frames that the server renders. */
-function showFrames(player, { max_pixels: maxPixels }) {
+function showFrames(player, settings) {
   player.renderer?.dispose();
   player.renderer = null;
   player.hdr?.hide();
   player.hdr = null;
-  const failed = (problem) => note(problem, 0);
-  player.frames = new Frames(find("frame"), player.scene.width, maxPixels, failed);
-  const { curve, show } = player.state;
-  player.set({
-    curve: SERVER_CURVES.includes(curve) ? curve : "reinhard",
-    show: SERVER_VIEWS.includes(show) ? show : "radiance",
-    clipping: false,
-    falseColor: false,
-  });
-  limitControls();
+  withdrawExtended(player);
+  player.frames = new Frames(find("frame"), player.scene.width, settings, note);
+  player.touch();
 }
 
 /** The version of the server's scene. */

@@ -141,6 +141,7 @@ export class Player {
   async replace(scene) {
     for (const { address } of this.scene.views) if (address) URL.revokeObjectURL(address);
     this.scene = scene;
+    this.frames?.forget();
     if (this.renderer) await this.renew(this.renderer, scene);
     this.set({});
   }
@@ -298,12 +299,12 @@ export class Player {
 
   /**
    * What is shown as a PNG file of 8 or 16 bits, as fine as the screen. Light above white
-   * is kept with 16 bits, as PQ. Null where the server has taken over.
+   * is kept with 16 bits, as PQ. Null where the server renders, and does not answer.
    */
   async png(bits) {
     const view = this.view(this.fullSize);
     const renderer = await this.sorted(view);
-    if (!renderer) return null;
+    if (!renderer) return this.frames.png(view, this.state, bits);
     const maps = renderer.composite(view, "read");
     const picture = renderer.target("png", view.width, view.height, renderer.deepFormat());
     renderer.develop(maps, this.state, picture);
