@@ -17,6 +17,7 @@ from viewer_tab import open_page, state
 
 from hdr_nsff.geometry import paths
 from hdr_nsff.scene.scene import Scene
+from hdr_nsff.viewer import display
 
 if find_browser() is None:
     pytest.skip("no Chromium", allow_module_level=True)
@@ -175,6 +176,83 @@ def test_buttons_work_by_pointer(viewer: Page) -> None:
     assert state(viewer, "mode") == "fly"
     viewer.click("#stats-button")
     viewer.wait("document.getElementById('stats').textContent.includes('Gaussians')")
+
+
+def choose(viewer: Page, select: str, value: str) -> None:
+    """Choose from a list, as people do by pointer or key."""
+    place = f"document.getElementById('{select}')"
+    chosen = f"{place}.value = '{value}', {place}.dispatchEvent(new Event('change'))"
+    viewer.run(chosen)
+
+
+def test_the_time_slider_stops_playback_where_it_is_put(viewer: Page) -> None:
+    viewer.run("viewer.set({playing: true, speed: 0.01})")
+    viewer.click("#time")
+    first, last = viewer.run("[viewer.first, viewer.last]")
+    assert state(viewer, "playing") is False
+    assert state(viewer, "time") == pytest.approx((first + last) / 2, abs=0.02 * (last - first))
+
+
+def test_time_goes_by_at_the_chosen_speed(viewer: Page) -> None:
+    choose(viewer, "speed", "0.25")
+    turn = "viewer.set({time: viewer.first, playing: true}), viewer.advance(0.2)"
+    assert viewer.run(f"{turn}, viewer.state.time - viewer.first") == pytest.approx(
+        0.2 * 0.25 * viewer.run("viewer.scene.fps")
+    )
+
+
+def test_curve_and_view_are_chosen_from_lists(viewer: Page) -> None:
+    curves = viewer.run("[...document.getElementById('curve').options].map(o => o.value)")
+    assert curves == ["camera 0", "agx 0", "neutral 0", "reinhard 0", "clip 0"]
+    for value in curves:
+        choose(viewer, "curve", value)
+        assert f"{state(viewer, 'curve')} {state(viewer, 'camera')}" == value
+    for value in ("depth", "motion", "flow", "radiance"):
+        choose(viewer, "show", value)
+        assert state(viewer, "show") == value
+
+
+def test_boxes_mark_clipping_and_show_false_color_with_its_legend(viewer: Page) -> None:
+    legend = "document.getElementById('legend')"
+    assert viewer.run(f"{legend}.hidden") is True
+    viewer.click("#clipping")
+    viewer.click("#false-color")
+    assert (state(viewer, "clipping"), state(viewer, "falseColor")) == (True, True)
+    assert viewer.run(f"{legend}.hidden") is False
+    colors = viewer.run(f"[...{legend}.children].map(band => band.style.backgroundColor)")
+    expected = [[round(255 * c) for c in color] for color in display.BAND_COLORS]
+    found = [[int(n) for n in color[4:-1].split(",")] for color in colors]
+    assert np.abs(np.array(found) - expected).max() <= 1
+    viewer.click("#false-color")
+    assert state(viewer, "falseColor") is False
+
+
+def test_the_divider_of_the_split_screen_is_dragged_and_moved_by_keys(viewer: Page) -> None:
+    viewer.click("#split")
+    left, top, width, height = viewer.run(
+        "(r => [r.x, r.y, r.width, r.height])("
+        "document.getElementById('picture').getBoundingClientRect())"
+    )
+    middle = top + height / 2
+    viewer.drag((left + width / 2, middle), (left + width / 4, middle))
+    assert state(viewer, "splitAt") == pytest.approx(0.25, abs=0.01)
+    assert state(viewer, "mode") == "filmed"  # the picture was not dragged
+    clip = viewer.run("document.getElementById('recorded').style.clipPath")
+    assert float(clip.split()[1].rstrip("%")) == pytest.approx(75, abs=1)
+    viewer.run("document.getElementById('divider').focus()")
+    viewer.press("ArrowRight")
+    assert state(viewer, "splitAt") == pytest.approx(0.3, abs=0.01)
+    assert state(viewer, "time") == viewer.run("viewer.first")
+
+
+def test_the_wheel_moves_closer(viewer: Page) -> None:
+    before = np.array(viewer.run("viewer.camera().c2w"))
+    place = {"x": 120, "y": 100, "deltaX": 0, "deltaY": -300}
+    viewer.call("Input.dispatchMouseEvent", type="mouseWheel", **place)
+    viewer.wait("viewer.state.mode === 'orbit'")
+    step = np.array(viewer.run("viewer.camera().c2w"))[:, 3] - before[:, 3]
+    near = viewer.run("viewer.scene.near")
+    np.testing.assert_allclose(step, 0.0006 * 300 * near * before[:, 2], atol=1e-6)
 
 
 def test_the_button_of_a_bracket_rounds_its_label_alone(
