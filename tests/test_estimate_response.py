@@ -97,6 +97,15 @@ def test_a_single_exposure_leaves_gamma() -> None:
     np.testing.assert_allclose(response.y[0, 0], response.x ** (1 / 2.2), atol=1e-9)
 
 
+def test_a_single_exposure_is_said_to_lack_light_beyond_its_white() -> None:
+    rng = np.random.default_rng(0)
+    views = [replace(wall_view(3 * t + 1, S_CURVE, rng), bracket=0, time=t) for t in range(6)]
+    words = describe(estimate_response(views, [0] * 6, [None], 0, 1), [None])
+    assert words.count("light beyond its white is not recorded") == 1
+    alternating = [wall_view(t, S_CURVE, rng) for t in range(6)]
+    assert "beyond its white" not in describe(estimate_response(alternating, [0] * 6, EV, 2, 1), EV)
+
+
 def test_the_papers_tone_mapper_is_left_as_published(measured: Response) -> None:
     t = mapper(kind="per_image", knots="even", from_recordings=False)
     t.start(measured)

@@ -46,9 +46,12 @@ def describe_source(response: Response, given_ev: Sequence[float | None]) -> str
 
 
 def describe_one_exposure(response: Response) -> str:
-    """Why a clip without brackets does not determine the response."""
+    """Why a clip without brackets determines no response, and what it lacks."""
     if response.drift is None:
-        return "a single exposure does not determine the response"
+        return (
+            "a single exposure does not determine the response; "
+            "light beyond its white is not recorded"
+        )
     why = response.problem
     if not why:
         span = np.ptp(response.drift)
