@@ -112,7 +112,7 @@ def test_a_gopros_times_are_read_with_a_stride(
 ) -> None:
     seconds = np.linspace(0.001, 0.012, FRAMES)
     written = gpmf.GoProFrames(seconds, 1 / seconds)
-    monkeypatch.setattr("hdr_nsff.prepare.exposure_times.read_gopro", lambda path, n: written)
+    monkeypatch.setattr("hdr_nsff.prepare.exposures.read_gopro", lambda path, n: written)
     write_video(tmp_path / "clip.mp4", list(clip([0.0], frames=FRAMES)), fps=50)
     m = prepared(tmp_path, tmp_path / "clip.mp4", stride=2)
     assert times(m) == pytest.approx(seconds[::2].tolist())

@@ -2,6 +2,7 @@
 
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,11 +19,16 @@ def entry(key: bytes, kind: bytes, size: int, content: bytes) -> bytes:
     return head + content + bytes(-len(content) % 4)
 
 
-def packet(seconds: list[float], iso: list[int]) -> bytes:
+def packet(
+    seconds: list[float], iso: list[int], gains: list[tuple[float, float, float]] | None = None
+) -> bytes:
     """A packet as a camera writes it: a device with streams, one of a text."""
     shutter = entry(b"SHUT", b"f", 4, struct.pack(f">{len(seconds)}f", *seconds))
     sensor = entry(b"ISOE", b"S", 2, struct.pack(f">{len(iso)}H", *iso))
     streams = [entry(b"STNM", b"c", 1, b"Exposure time") + shutter, sensor]
+    if gains is not None:
+        content = b"".join(struct.pack(">3f", *rgb) for rgb in gains)
+        streams.append(entry(b"WRGB", b"f", 12, content))
     return entry(b"DEVC", b"\0", 1, b"".join(entry(b"STRM", b"\0", 1, s) for s in streams))
 
 
@@ -51,6 +57,23 @@ def test_exposures_of_other_frames_are_not_taken(track: list[bytes]) -> None:
     assert gpmf.read_gopro(Path("clip.mp4"), 8) is None
     track[:] = [packet([], [])]
     assert gpmf.read_gopro(Path("clip.mp4"), 4) is None
+
+
+def test_white_balance_lies_between_the_gains_that_are_written(track: list[bytes]) -> None:
+    """Two gains in a packet of four frames, one in the next."""
+    red = [(2.0, 1.0, 1.0), (4.0, 1.0, 1.0)]
+    track[:] = [packet([0.01] * 4, [100] * 4, red), packet([0.01] * 2, [100] * 2, [(8.0, 1, 0.5)])]
+    found = gpmf.read_gopro(Path("clip.mp4"), 6)
+    assert found is not None and found.colors is not None
+    np.testing.assert_allclose(found.colors[:, 0], [1, 1.5, 2, 2.5, 3, 3], atol=1e-6)
+    np.testing.assert_allclose(found.colors[:, 2], [0, 0, 0, -0.5, -1, -1], atol=1e-6)
+
+
+@pytest.mark.parametrize("gains", [None, [], [(0.0, 1.0, 1.0)], [(np.nan, 1.0, 1.0)]])
+def test_impossible_gains_are_not_taken(track: list[bytes], gains: Any) -> None:
+    track[:] = [packet([0.01] * 4, [100] * 4, gains)]
+    found = gpmf.read_gopro(Path("clip.mp4"), 4)
+    assert found is not None and found.colors is None
 
 
 @pytest.mark.parametrize("seconds", [np.nan, np.inf, 0.0])

@@ -3,7 +3,8 @@ Format (GPMF, https://github.com/gopro/gpmf-parser).
 
 The track's packets are nested entries of a key of four letters, a type, the size of a
 value, their number, and the values, padded to four bytes. `SHUT` holds exposure times
-in seconds, `ISOE` the sensor's sensitivity, both once a frame.
+in seconds, `ISOE` the sensor's sensitivity, both once a frame. `WRGB` holds gains of
+red, green and blue (white balance), ten times a second.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ class GoProFrames:
 
     seconds: np.ndarray  # (T,) exposure time
     iso: np.ndarray  # (T,) of the sensor
+    colors: np.ndarray | None = None  # (T, 3) log2 gains of red, green and blue
 
     @property
     def ev(self) -> np.ndarray:
@@ -44,19 +46,49 @@ def read_gopro(path: Path, num_frames: int) -> GoProFrames | None:
     """
     seconds: list[float] = []
     iso: list[float] = []
+    gains: list[tuple[int, np.ndarray]] = []  # of a packet, from which frame on
     for packet in metadata_packets(path):
+        first = len(seconds)
         for key, values in entries(packet):
             if key == b"SHUT":
                 seconds += values.tolist()
             elif key == b"ISOE":
                 iso += values.tolist()
+            elif key == b"WRGB":
+                gains.append((first, values[: len(values) // 3 * 3].reshape(-1, 3)))
     if not seconds or not all(0 < value < np.inf for value in seconds):
         return None
     if len(iso) != len(seconds) or not all(0 < value < np.inf for value in iso):
         iso = [100.0] * len(seconds)
     if abs(len(seconds) - num_frames) > max(1, MAX_MISSING_SHARE * num_frames):
         return None
-    return GoProFrames(per_frame(seconds, num_frames), per_frame(iso, num_frames))
+    colors = frame_gains(gains, len(seconds), num_frames)
+    return GoProFrames(per_frame(seconds, num_frames), per_frame(iso, num_frames), colors)
+
+
+def frame_gains(
+    gains: list[tuple[int, np.ndarray]], num_written: int, num_frames: int
+) -> np.ndarray | None:
+    """The log2 gains (num_frames, 3) of every frame between those that packets hold.
+
+    `gains`: of a packet the number of its first frame, and gains (N, 3) at times evenly
+    spaced up to the next packet's; `num_written` frames in all. None without gains, or
+    with impossible ones.
+    """
+    if not any(len(values) for _, values in gains):
+        return None
+    ends = [first for first, _ in gains[1:]] + [num_written]
+    at = np.concatenate(
+        [
+            np.linspace(first, end, len(values), endpoint=False)
+            for (first, values), end in zip(gains, ends, strict=True)
+        ]
+    )
+    known = np.concatenate([values for _, values in gains])
+    if not ((known > 0) & (known < np.inf)).all():
+        return None
+    frames = np.arange(num_frames)
+    return np.stack([np.interp(frames, at, np.log2(known[:, c])) for c in range(3)], -1)
 
 
 def per_frame(values: list[float], num_frames: int) -> np.ndarray:

@@ -7,8 +7,7 @@ how far motion blurs, is a matter of time alone.
 from __future__ import annotations
 
 from hdr_nsff.footage.exposure_lists import read_exif_seconds, read_listed, row_of
-from hdr_nsff.footage.gpmf import read_gopro
-from hdr_nsff.prepare.exposures import FrameExposures
+from hdr_nsff.prepare.exposures import FrameExposures, gopro_metadata
 from hdr_nsff.prepare.work import Work
 
 
@@ -44,8 +43,7 @@ def times_in_metadata(work: Work) -> list[float | None]:
         files = work.footage.files
         return [read_exif_seconds(files[f.source]) for f in frames]
     seconds: list[float | None] = [None] * len(frames)
-    for own, files_of_camera in zip(work.camera_frames(), work.footage.cameras, strict=True):
-        written = read_gopro(files_of_camera[0], work.footage.count or 0)
+    for own, written in zip(work.camera_frames(), gopro_metadata(work), strict=True):
         if written is not None:
             for i in own:
                 seconds[i] = float(written.seconds[numbers[i]])

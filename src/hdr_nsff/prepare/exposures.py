@@ -21,7 +21,7 @@ from hdr_nsff.footage.exposure_lists import (
     read_exif_ev,
     read_exposure_csv,
 )
-from hdr_nsff.footage.gpmf import read_gopro
+from hdr_nsff.footage.gpmf import GoProFrames, read_gopro
 from hdr_nsff.footage.ingest import read_frames
 from hdr_nsff.prepare.times import by_timestamps, evenly_spaced
 from hdr_nsff.prepare.work import Work
@@ -277,11 +277,16 @@ def gopro_exposures(work: Work) -> list[float]:
     """The EVs of the frames of videos, where a GoPro wrote them into these."""
     known: list[float] = []
     numbers = work.frame_numbers()
-    for own, files in zip(work.camera_frames(), work.footage.cameras, strict=True):
-        written = read_gopro(files[0], work.footage.count or 0)
+    for own, written in zip(work.camera_frames(), gopro_metadata(work), strict=True):
         if written is not None:
             known += [float(written.ev[numbers[i]]) for i in own]
     return known
+
+
+def gopro_metadata(work: Work) -> list[GoProFrames | None]:
+    """What a GoPro wrote of the frames of each video of the footage."""
+    count = max([work.footage.count, *(number + 1 for number in work.frame_numbers())])
+    return [read_gopro(files[0], count) for files in work.footage.cameras]
 
 
 def track_cycle(work: Work, evs: list[float]) -> list[float]:

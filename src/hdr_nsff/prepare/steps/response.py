@@ -12,10 +12,12 @@ import numpy as np
 from hdr_nsff.core.images import read_mask
 from hdr_nsff.core.io import read_npy
 from hdr_nsff.footage.ingest import read_frames
+from hdr_nsff.prepare.exposures import GOPRO
+from hdr_nsff.prepare.given_white_balance import given_white_balance
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.radiometry.estimate_response import estimate_response
-from hdr_nsff.radiometry.frame_colors import frame_white_balance
+from hdr_nsff.radiometry.frame_colors import FrameColorsTuning, frame_white_balance
 from hdr_nsff.radiometry.response_words import describe
 from hdr_nsff.radiometry.static_samples import ResponseView
 from hdr_nsff.scene.manifest import FrameEntry
@@ -42,11 +44,17 @@ def find_response(work: Work, views: Sequence[ResponseView] | None = None) -> St
         drift=given_drift(work),
         may_drift=may_drift(work),
     )
-    colors = None
+    colors = given = None
     if m.rig == m.num_cameras == 1:
         colors = frame_white_balance(views, response.x, response.y[0])
+        given = given_white_balance(work)
+    balance = white_balance_of_frames(work, colors)
+    words = describe_colors(colors)
+    if given is not None:
+        balance = {f.index: given[f.index].round(5).tolist() for f in m.frames}
+        words = describe_given_colors(given, colors, [f.index for f in work.train])
     return StepResult(
-        note=describe(response, m.known_ev) + describe_colors(colors),
+        note=describe(response, m.known_ev) + words,
         details={
             "misfit": response.misfit,
             "ev": response.ev.round(4).tolist(),
@@ -56,7 +64,7 @@ def find_response(work: Work, views: Sequence[ResponseView] | None = None) -> St
         manifest={"response": "response.json"},
         frames={
             "drift": drift_of_frames(work, response.drift),
-            "white_balance": white_balance_of_frames(work, colors),
+            "white_balance": balance,
         },
         files={"response.json": lambda path: write_response(path, response)},
     )
@@ -80,6 +88,19 @@ def describe_colors(colors: np.ndarray | None) -> str:
     low, high = colors.min(0), colors.max(0)
     red, blue = high[0] - low[0], high[2] - low[2]
     return f"; white balance drifts: red by {red:.2f}, blue by {blue:.2f} stops"
+
+
+def describe_given_colors(given: np.ndarray, seen: np.ndarray | None, train: list[int]) -> str:
+    """What a note says of the `given` white balance (T, 3) of all frames, and of what
+    static points show of that of the `train` frames: `seen` (V, 3).
+    """
+    words = describe_colors(given) + f" by {GOPRO}"
+    if seen is None:
+        return words + ", which static points do not show"
+    off = float(np.abs(seen - given[train] + given[train].mean(0)).max())
+    if off >= FrameColorsTuning().min_drift:
+        words += f", with which the pixels disagree by up to {off:.2f} stops"
+    return words
 
 
 def may_drift(work: Work) -> bool:
