@@ -8,8 +8,9 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.footage.colmap import ColmapCamera, ColmapModel
 from hdr_nsff.geometry.lens import Lens, distorted_picture
 from hdr_nsff.priors.poses import sfm
-from hdr_nsff.priors.poses.estimate import Mapper, estimate_poses
-from hdr_nsff.priors.poses.lens import bent_cameras
+from hdr_nsff.priors.poses.estimate import Mapper, PosesTuning, estimate_poses
+from hdr_nsff.priors.poses.lens import LensTuning, bent_cameras
+from hdr_nsff.priors.poses.reconstruct import ReconstructionTuning
 
 LENS = Lens(posed_clips.K, (0.15, 0.0, 0.0, 0.0), posed_clips.W, posed_clips.H)
 
@@ -57,7 +58,7 @@ def test_given_distortion_is_held_and_gets_a_focal_length(tmp_path, clip):
 
 
 def test_where_no_mapping_with_the_lens_succeeds_its_fit_counts(tmp_path, clip, monkeypatch):
-    def fail(self, mapping):
+    def fail(self, mapping, max_error_px):
         raise InputError("too few views")
 
     bent = np.stack([distorted_picture(frame, posed_clips.K, LENS) for frame in clip])
@@ -65,6 +66,18 @@ def test_where_no_mapping_with_the_lens_succeeds_its_fit_counts(tmp_path, clip, 
     lens = estimate_poses(bent, None, tmp_path, threads=1, lens="auto").lenses[0]
     assert lens.max_displacement_px() == pytest.approx(LENS.max_displacement_px(), rel=0.3)
     assert (lens.width, lens.height) == (posed_clips.W, posed_clips.H)
+
+
+def test_a_lens_whose_model_fits_worse_than_the_pinholes_is_none(tmp_path, clip):
+    bent = np.stack([distorted_picture(frame, posed_clips.K, LENS) for frame in clip])
+    strict = ReconstructionTuning(lens=LensTuning(max_model_error_share=0.01))
+    searched, plain = (
+        estimate_poses(
+            bent, None, tmp_path, threads=1, lens=choice, tuning=PosesTuning(reconstruction=strict)
+        )
+        for choice in ("auto", "none")
+    )
+    assert not searched.lenses and np.array_equal(searched.c2w, plain.c2w)
 
 
 @pytest.mark.parametrize(

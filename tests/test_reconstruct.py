@@ -127,14 +127,13 @@ def test_no_more_mappings_than_allowed_are_tried(tmp_path, monkeypatch, limit, t
 @pytest.mark.parametrize(
     ("ways", "tried", "taken"),
     [
-        ([(250, 0.6), (260, 0.3)], 1, 250),  # the first good one
-        ([(60, 0.4), (250, 0.6), (60, 0.1), (300, 0.3)], 5, 300),  # the best good one
-        ([(None, 0.0), (250, 0.6), (300, 0.3)], 2, 250),  # too few images are no such doubt
+        ([(250, 0.5), (260, 0.3)], 1, 250),  # the first good one
+        ([(60, 0.4), (250, 0.5), (60, 0.1), (300, 0.3)], 5, 300),  # the best good one
+        ([(250, 0.7), (300, 0.6)], 5, 300),  # the same where the first one fits badly
+        ([(None, 0.0), (250, 0.5), (300, 0.3)], 2, 250),  # too few images are no such doubt
     ],
 )
-def test_where_all_views_fit_an_impossible_lens_every_way_is_tried(
-    tmp_path, monkeypatch, ways, tried, taken
-):
+def test_where_a_model_is_in_doubt_every_way_is_tried(tmp_path, monkeypatch, ways, tried, taken):
     def of_way(focal, error):
         found = model(focal or 250, 5 if focal else 2)
         return replace(found, errors=np.full(9, error), track_lengths=np.full(9, 3))

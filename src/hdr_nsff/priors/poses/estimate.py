@@ -46,6 +46,7 @@ from hdr_nsff.priors.poses.reconstruct import (
     ReconstructionTuning,
     SfmViews,
     best_model,
+    median_error,
     sfm_views,
     views_of_images,
 )
@@ -234,8 +235,9 @@ class Mapper:
         fit = lens_fit(self.earlier)
         bent = [] if fit is None else bent_cameras(fit, model, scale, self.tuning.lens)
         if fit is not None and bent:
+            limit = self.tuning.lens.max_model_error_share * median_error(model, self.tuning)
             try:
-                poses = self.bent_poses(bent[0])
+                poses = self.bent_poses(bent[0], limit)
             except InputError:  # the lens that fits the model of a pinhole has to do
                 lenses = self.lenses(model, lambda camera: fitted_lens(fit, model, camera))
                 poses = replace(self.of_model(model, scale), lenses=lenses)
@@ -243,9 +245,10 @@ class Mapper:
                 return poses
         return self.of_model(model, scale)
 
-    def bent_poses(self, mapping: Mapping) -> Poses:
+    def bent_poses(self, mapping: Mapping, max_error_px: float = np.inf) -> Poses:
         """Poses of a reconstruction with a lens, which starts from the earlier one's if
-        there is one, and the lenses unless they bend too little after all.
+        there is one, and the lenses unless they bend too little after all, or points
+        miss by more than `max_error_px` in the median, pixels of the images.
         """
         start = {name: c for name, c in self.earlier.model.items() if name != LENS_FILE}
         round_of_its_own = EarlierRounds(self.earlier.matches, start)
@@ -256,6 +259,8 @@ class Mapper:
         poses = self.of_model(model, scale)
         largest = max(lens.max_displacement_px() for lens in lenses.values())
         if mapping.refine and largest < self.tuning.lens.min_displacement_px:
+            return poses
+        if median_error(model, self.tuning) > max_error_px:
             return poses
         return replace(poses, lenses=lenses)
 

@@ -33,6 +33,9 @@ class LensTuning:
     # more on seven rendered pinhole clips, 0.9968 on photographs of lenses that nobody
     # states; with 5 pixels 0.961, and 0.9945 where the camera walks forward
     max_error_share: float = 0.996
+    # median error of the model that is mapped with the lens over that of the pinhole's
+    # (with a false lens, before a flight straight ahead: 1.10)
+    max_model_error_share: float = 1.02
     # a longer lens bends little, and behind it what bends and what is farther away look
     # alike
     min_fov_degrees: float = 25.0

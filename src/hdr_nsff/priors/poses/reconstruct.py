@@ -3,9 +3,9 @@
 pycolmap maps the views (`sfm.py`) incrementally, from the focal length of a usual lens
 and of a long one, then globally, with and without leveled contrast, until enough of
 them register with a focal length that a lens can have. Where the first way fails, the
-others are tried side by side. Where they all register with one that no lens has, as
-before a camera that flies straight ahead, every way is tried, and the one whose points
-fit best is taken.
+others are tried side by side. Where they register, but with one that no lens has, or
+fit badly, as before a camera that flies straight ahead, every way is tried, and the one
+that fits best is taken.
 """
 
 from __future__ import annotations
@@ -73,6 +73,10 @@ class ReconstructionTuning:
     # does not find a lens of 20 (from 30 it does)
     long_lens_fov_degrees: float = 24.0
     enough_registered: float = 0.9  # share of the views that ends the search for a model
+    # median error of points, pixels of the images, beyond which a model is in doubt: 16
+    # clips have 0.47 at most, wrong focal lengths of a flight straight ahead 0.62 to
+    # 0.67 (that flight with the right one: 0.41)
+    max_good_error_px: float = 0.55
     max_attempts: int = 8  # mappings before the search ends
     min_registered: float = MIN_REGISTERED_SHARE  # share of the views below which poses have failed
     min_track_views: int = 3  # of a point that is kept
@@ -241,7 +245,7 @@ class Search:
     tuning: ReconstructionTuning
     best: ColmapModel | None = None
     good: list[tuple[ColmapModel, Path]] = field(default_factory=list)  # with their files
-    in_doubt: bool = False  # all views fit a lens that no camera has
+    in_doubt: bool = False  # enough views register, but no camera is like that
     failures: list[str] = field(default_factory=list)
 
     @property
@@ -264,9 +268,11 @@ class Search:
             rank = self.rank(model)
             if self.best is None or rank > self.rank(self.best):
                 self.best = model
-            if rank[:2] == (True, True):
+            plausible, enough = rank[:2]
+            if plausible and enough:
                 self.good.append((model, folder))
-            self.in_doubt |= rank[:2] == (False, True)
+            fits = median_error(model, self.tuning) <= self.tuning.max_good_error_px
+            self.in_doubt |= enough and not (plausible and fits)
 
     def rank(self, model: ColmapModel) -> tuple[bool, bool, int, int]:
         """The order of models."""
