@@ -21,6 +21,7 @@ from hdr_nsff.maths.hdr_signal import display_light, encode, pq_decode, ycbcr_pl
 from hdr_nsff.radiometry.exposure_cycle import detect_cycle
 from hdr_nsff.radiometry.recording import response_curve
 from hdr_nsff.scene.truth import Truth
+from hdr_nsff.synth.auto_exposure import auto_exposure
 from hdr_nsff.synth.reexpose import ReexposeConfig, plan_frames, reexpose
 
 
@@ -218,6 +219,38 @@ def test_auto_exposure_drifts_and_is_kept_as_truth(tmp_path):
     assert np.mean(drift) == pytest.approx(0, abs=1e-9) and 2 < np.ptp(drift) < 4
     brightness = [np.median(read_image(f)) for f in files]
     assert np.corrcoef(brightness, drift)[0, 1] > 0.8
+
+
+def test_auto_exposure_may_jump_and_the_jumps_are_written_down(tmp_path):
+    clip = ordinary_clip(tmp_path / "in", count=70)
+    auto = ReexposeConfig(clip, tmp_path / "auto", exposure="auto", max_size=40)
+    steps = replace(auto, out=tmp_path / "steps", exposure="steps")
+    drifts = [
+        np.array(Truth.open(reexpose(c) / "truth").clip_drift, np.float64) for c in (auto, steps)
+    ]
+    jumps = json.loads((tmp_path / "steps/reexpose.json").read_text())["jumps"]
+    assert len(jumps) == 2 and set(map(abs, jumps.values())) == {1.0}
+    expected = np.zeros(70)
+    for frame, ev in jumps.items():
+        expected[int(frame) :] += ev
+    assert np.abs(expected).max() == 1.0
+    np.testing.assert_allclose(drifts[1] - drifts[0], expected - expected.mean(), atol=1e-9)
+    assert "jumps" not in json.loads((tmp_path / "auto/reexpose.json").read_text())
+    reexpose(steps)  # once more, it is the same problem
+
+
+def test_auto_exposure_without_jumps_stays_as_it_was_measured():
+    """The documentation has results on clips that it made."""
+    found = auto_exposure(6, range(6), 0, {})
+    expected = [
+        1.030327029901727,
+        0.3897665181620387,
+        -1.0641601354166277,
+        -1.7824671068401656,
+        0.12659122765504704,
+        1.2999424665379804,
+    ]
+    assert found.tolist() == pytest.approx(expected, abs=1e-12)
 
 
 def test_without_auto_exposure_no_drift_is_kept(tmp_path):

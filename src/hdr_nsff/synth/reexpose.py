@@ -15,7 +15,7 @@ training.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -51,6 +51,7 @@ from hdr_nsff.radiometry.hdr_references import (
 from hdr_nsff.radiometry.hdr_stills import HdrStill
 from hdr_nsff.radiometry.recording import Curve, record, response_curve
 from hdr_nsff.scene.truth import Truth, TruthView
+from hdr_nsff.synth.auto_exposure import auto_exposure, exposure_jumps
 from hdr_nsff.synth.settings import MAX_NOISE, sensor_noise
 
 MAX_SEED = 2**63
@@ -68,9 +69,10 @@ class ReexposeConfig:
     """Folder to write `clip/` and `truth/` to."""
     ev: str = "-2,0,2"
     """log2 exposures of one cycle; 0 records white of the clip as white."""
-    exposure: Literal["fixed", "auto"] = "fixed"
+    exposure: Literal["fixed", "auto", "steps"] = "fixed"
     """fixed: every frame has an exposure of the cycle; auto: all of them drift on top,
-    as with auto exposure (`--ev 0`: nothing but the drift).
+    as with auto exposure (`--ev 0`: nothing but the drift); steps: the same, with a
+    jump of one stop now and then.
     """
     noise: float = 1.0
     """Sensor noise: 1 is a small sensor of 6000 electrons, 0 none."""
@@ -112,10 +114,6 @@ class ReexposeConfig:
 
 GAMMA = 2.2  # by which the clip is linearized
 MIN_FRAMES = 3  # of the footage
-# Auto exposure: stops of its smooth drift, and how it hunts (hand-chosen)
-DRIFT_RANGE = 3.0
-NUM_HUNTS = 3
-HUNT_EV, HUNT_FRAMES = 0.3, 8
 
 
 @dataclass(frozen=True)
@@ -175,10 +173,8 @@ def reexpose(config: ReexposeConfig) -> Path:
         masks = {}
         if config.masks is not None:
             masks = frame_masks(config.masks, plan.test, numbers, size)
-        drift = np.zeros(len(numbers))
-        if config.exposure == "auto":
-            drift = auto_exposure(plan, config.seed)
-        claim(config, footage)  # once nothing can be wrong with the settings any more
+        drift, jumps = frame_drift(config, plan)
+        claim(config, footage, jumps)  # once nothing can be wrong with the settings any more
         write_frames(config, footage, plan, evs, drift, response)
         write_truth(config.out, plan, evs, drift, response, poses, masks)
         write_linearized(config, footage, len(numbers))
@@ -243,12 +239,16 @@ def chosen(config: ReexposeConfig, footage: Footage) -> Iterator[FootageFrame]:
     return read_frames(footage, config.start, config.end, config.stride, config.max_size)
 
 
-def claim(config: ReexposeConfig, footage: Footage) -> None:
-    """Write `reexpose.json`; InputError where the output holds something else."""
+def claim(config: ReexposeConfig, footage: Footage, jumps: Mapping[int, float]) -> None:
+    """Write `reexpose.json`, with the `jumps` of auto exposure in stops by the frame
+    from which on they hold; InputError where the output holds something else.
+    """
     settings: dict[str, Any] = {"clip": str(config.clip)}
     for name, value in asdict(config).items():
         if name not in ("clip", "out", "hdr_video", "hdr_codec", "hdr_still"):
             settings[name] = str(value) if isinstance(value, Path) else value
+    if jumps:
+        settings["jumps"] = {str(frame): ev for frame, ev in jumps.items()}
     settings["inputs"] = {name: hash_file(file) for name, file in footage.files.items()}
     path = config.out / "reexpose.json"
     if path.is_file():
@@ -299,24 +299,13 @@ def plan_frames(count: int, cycle: int, hold_out: int, remove: bool) -> FramePla
     return FramePlan(bracket, test, kept)
 
 
-def auto_exposure(plan: FramePlan, seed: int) -> np.ndarray:
-    """EV by which auto exposure moves every frame (T,), mean 0 over the footage.
-
-    A smooth random curve over `DRIFT_RANGE`, and hunting: after a few random frames it
-    overshoots and swings in.
-    """
-    rng = np.random.default_rng([seed, len(plan.bracket)])
-    time = np.arange(len(plan.bracket))
-    drift = np.zeros(len(time))
-    for waves in range(1, 4):
-        phase = rng.uniform(0, 2 * np.pi)
-        drift += np.sin(2 * np.pi * waves * time / (1.5 * len(time)) + phase) / waves
-    drift *= DRIFT_RANGE / max(float(np.ptp(drift)), 1e-6)
-    for start in rng.choice(len(time), min(NUM_HUNTS, len(time)), replace=False):
-        since = np.maximum(time - start, 0)
-        swing = np.exp(-since / HUNT_FRAMES) * np.sin(2 * np.pi * since / HUNT_FRAMES)
-        drift += HUNT_EV * rng.choice([-1, 1]) * swing
-    return drift - drift[plan.kept].mean()
+def frame_drift(config: ReexposeConfig, plan: FramePlan) -> tuple[np.ndarray, dict[int, float]]:
+    """EV by which every frame (T,) leaves its bracket, and the jumps in it."""
+    count = len(plan.bracket)
+    if config.exposure == "fixed":
+        return np.zeros(count), {}
+    jumps = exposure_jumps(count, config.seed) if config.exposure == "steps" else {}
+    return auto_exposure(count, plan.kept, config.seed, jumps), jumps
 
 
 def write_frames(
