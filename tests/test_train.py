@@ -324,6 +324,24 @@ def test_grid_schedules_follow_the_share_of_the_run() -> None:
     )
 
 
+def test_training_says_its_time_left_early_and_at_checkpoints(
+    toy: Scene, toy_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    budget = Budget(steps=1000, minutes=None)
+    t = trainer(replace(config(toy_folder, tmp_path / "run"), budget=budget), toy)
+    capsys.readouterr()
+    with t.writer.progress_bar():
+        for step in (1, 25, 50, 75):  # a second each
+            clock = replace(t.clock, step=step, seconds=float(step))
+            t.writer.log(clock, {"psnr": 20.0})
+        t.writer.finish_checkpoint(clock)
+    printed = capsys.readouterr().err.splitlines()
+    assert printed == [
+        "train: 2%, step 25, 20.0 dB, 16 min left",
+        "train: 8%, step 75, 20.0 dB, 15 min left",
+    ]
+
+
 def test_without_steps_the_clock_counts_minutes() -> None:
     clock = Clock(Budget(minutes=5.0), Schedule(period=0.5), 24, 10**6, 75.0)
     assert clock.progress == 0.25 and clock.phase == 0.5

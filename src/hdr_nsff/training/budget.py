@@ -10,6 +10,8 @@ from typing import Annotated
 
 from annotated_types import Ge, Gt, Le
 
+from hdr_nsff.core.progress import seconds_left
+
 # minutes of training where none are given (hand-chosen): of a clip of so many pixels in
 # all frames, and at most
 SMALL_CLIP_MINUTES, SMALL_CLIP_PIXELS = 5.0, 1_700_000
@@ -90,6 +92,11 @@ class Clock:
     def progress(self) -> float:
         """Share of the run that is done, 0 to 1."""
         return self.budget.progress(self.step, self.seconds)
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Seconds of training that are left at the speed so far; None at the start."""
+        return seconds_left(self.progress, 1.0, self.seconds)
 
     @property
     def phase(self) -> float:

@@ -14,7 +14,7 @@ from dataclasses import replace
 from torch import nn
 
 from hdr_nsff.core.checkpoints import latest_checkpoint, pack, save_checkpoint, unpack
-from hdr_nsff.core.progress import bar, say
+from hdr_nsff.core.progress import SHORT_SECONDS, bar, say, time_left
 from hdr_nsff.fields.base import RadianceField
 from hdr_nsff.scene.scene import Frame, Scene
 from hdr_nsff.tonemap.base import ToneMapper
@@ -44,6 +44,7 @@ class RunWriter:
         self.progress = bar()
         self.psnr = ""  # of the last line of the log
         self.last_checkpoint = time.monotonic()
+        self.spoken = False  # whether a line has said how long training takes
 
     def say(self, message: str | None) -> None:
         """Print a line, if there is one, from the main process only."""
@@ -77,9 +78,9 @@ class RunWriter:
         """Show how far the run is, on a terminal."""
         self.last_checkpoint = time.monotonic()
         with self.progress:
-            self.task = self.progress.add_task("train", total=1000, note="")
+            self.task = self.progress.add_task("train", total=1000, note="", left=None)
             yield
-            self.progress.update(self.task, completed=1000)
+            self.progress.update(self.task, completed=1000, left=0.0)
 
     def log(self, clock: Clock, values: dict[str, float]) -> None:
         """Every `LOG_EVERY` steps, append a line to the log and move the bar."""
@@ -87,7 +88,14 @@ class RunWriter:
             return
         run_folder.append_log(self.config.out, clock, self.num_rays, values)
         self.psnr = f"{values['psnr']:.1f} dB"
-        self.progress.update(self.task, completed=round(1000 * clock.progress), note=self.psnr)
+        self.progress.update(
+            self.task,
+            completed=round(1000 * clock.progress),
+            note=self.psnr,
+            left=clock.seconds_left,
+        )
+        if not self.spoken and (clock.seconds_left or 0.0) > SHORT_SECONDS:
+            self.report(clock)
 
     def checkpoint_due(self) -> bool:
         """Whether the last checkpoint is old enough to write another."""
@@ -102,8 +110,17 @@ class RunWriter:
     def finish_checkpoint(self, clock: Clock) -> None:
         """Start the time to the next checkpoint; report progress where no bar does."""
         self.last_checkpoint = time.monotonic()
-        if not self.progress.live.is_started:
-            self.say(f"train: {clock.progress:.0%}, step {clock.step}, {self.psnr}")
+        self.report(clock)
+
+    def report(self, clock: Clock) -> None:
+        """Print progress and the time left, where no bar shows them."""
+        self.spoken = True
+        if self.progress.live.is_started:
+            return
+        line = f"train: {clock.progress:.0%}, step {clock.step}, {self.psnr}"
+        if clock.seconds_left is not None:
+            line += f", {time_left(clock.seconds_left)}"
+        self.say(line)
 
     def save_snapshot(self, clock: Clock, share: float) -> None:
         """Keep what was learned by a `share` of the run, without optimizers."""
