@@ -11,14 +11,16 @@ import numpy as np
 import pytest
 from toy_scene import EV, ToyScene
 
-from hdr_nsff.check import lens, measure
+from hdr_nsff.check import given, lens, measure
 from hdr_nsff.check.check import CheckConfig, check
 from hdr_nsff.check.facts import CameraFacts, ClipFacts, ExposureFacts, FileFacts, LensFacts
 from hdr_nsff.check.findings import Finding, judge, outlook
 from hdr_nsff.check.measure import measure_clip
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import read_image, write_png
+from hdr_nsff.core.video import write_video
 from hdr_nsff.footage.frame_files import CHECK_PICTURE, frame_files
+from hdr_nsff.footage.gpmf import GoProFrames
 from hdr_nsff.geometry.poses import Poses
 from hdr_nsff.priors.poses.sfm import LENS_FILE, LensFit
 from hdr_nsff.priors.poses.view_matches import EarlierRounds
@@ -175,17 +177,17 @@ def listed(clip: Path, evs: list[float]) -> list[Finding]:
 
 def test_a_list_of_auto_exposure_is_no_list_of_brackets(tmp_path: Path) -> None:
     drift = [0.1 * t - 0.6 for t in range(FRAMES)]
-    works, given, *_ = listed(clip_of(tmp_path / "a", still_scene, drift), drift)
+    works, found, *_ = listed(clip_of(tmp_path / "a", still_scene, drift), drift)
     assert works.text.startswith("partly: the exposure drifts by about 1.1 EV")
-    assert given.level == "warning" and "gives drift by 1.10 EV: auto exposure" in given.text
+    assert found.level == "warning" and "gives drift by 1.10 EV: auto exposure" in found.text
     both = [ev + 2.0 * (t % 2) for t, ev in enumerate(drift)]
-    works, given, *_ = listed(clip_of(tmp_path / "b", still_scene, both), both)
-    assert works.text == "yes" and given.level == "good"
-    assert "2 exposures are given by exposures.csv, 2.0 EV in all, which drift" in given.text
+    works, found, *_ = listed(clip_of(tmp_path / "b", still_scene, both), both)
+    assert works.text == "yes" and found.level == "good"
+    assert "2 exposures are given by exposures.csv, 2.0 EV in all, which drift" in found.text
 
 
 @pytest.mark.parametrize(
-    ("recorded", "given", "problem"),
+    ("recorded", "written", "problem"),
     [
         ([0.0, -2.0], [0.0, 0.0], "do not alternate, but the brightness repeats every 2"),
         ([0.0, -2.0], [-2.0, 0.0], "go the way the brightness goes"),
@@ -193,10 +195,10 @@ def test_a_list_of_auto_exposure_is_no_list_of_brackets(tmp_path: Path) -> None:
     ],
 )
 def test_a_list_that_the_pixels_contradict_is_reported(
-    tmp_path: Path, recorded: list[float], given: list[float], problem: str
+    tmp_path: Path, recorded: list[float], written: list[float], problem: str
 ) -> None:
     clip = clip_of(tmp_path, still_scene, recorded * (FRAMES // 2))
-    works, exposure, contradiction, *_ = listed(clip, given * (FRAMES // 2))
+    works, exposure, contradiction, *_ = listed(clip, written * (FRAMES // 2))
     assert works.text == "unknown: exposures.csv and the pixels disagree"
     assert exposure.level == "note"
     assert problem in contradiction.text and "--exposures auto" in contradiction.advice
@@ -207,6 +209,21 @@ def test_a_list_that_drifts_the_wrong_way_is_reported(tmp_path: Path) -> None:
     works, _, contradiction, *_ = listed(clip_of(tmp_path, still_scene, drift), drift[::-1])
     assert works.text.startswith("unknown")
     assert "a given drift of 1.1 EV changes points of the scene like -1.1" in contradiction.text
+
+
+def test_exposures_that_a_gopro_wrote_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drift = np.array([0.1 * t - 0.6 for t in range(FRAMES)])
+    folder = clip_of(tmp_path / "frames", still_scene, drift.tolist())
+    frames = [read_image(path)[..., :3] for path in frame_files(folder)]
+    write_video(tmp_path / "gopro.mp4", frames)
+    written = GoProFrames(0.01 * 2**drift, np.full(FRAMES, 100.0))
+    monkeypatch.setattr(given, "read_gopro", lambda path, count: written)
+    facts, _, brackets = measure_clip(tmp_path / "gopro.mp4")
+    assert facts.exposure.given == "GoPro's metadata" and brackets == [0] * FRAMES
+    assert facts.exposure.given_drift_ev == pytest.approx(1.1) and facts.exposure.ev == (0.0,)
+    assert not facts.exposure.contradictions
 
 
 def test_the_picture_of_check_is_no_frame(tmp_path: Path) -> None:

@@ -8,7 +8,8 @@ import numpy as np
 
 from hdr_nsff.footage.exposure_lists import ev_in_list, read_exif_ev, read_exposure_csv
 from hdr_nsff.footage.footage import Footage
-from hdr_nsff.prepare.exposures import EXIF, MIN_DRIFT_EV
+from hdr_nsff.footage.gpmf import read_gopro
+from hdr_nsff.prepare.exposures import EXIF, GOPRO, MIN_DRIFT_EV
 from hdr_nsff.radiometry import exposure_cycle as exposure
 from hdr_nsff.radiometry.dropped_frames import find_cycle
 
@@ -17,15 +18,17 @@ from hdr_nsff.radiometry.dropped_frames import find_cycle
 class GivenExposures:
     """Where the exposures of frames are written down, and what they are."""
 
-    source: str  # the name of a list, or `EXIF`
+    source: str  # the name of a list, `EXIF` or `GOPRO`
     ev: list[float]  # (T,) to any reference
 
     @property
     def follows_no_cycle(self) -> bool:
-        """Whether they are too many for a cycle, or metadata of less than a step: auto
-        exposure.
+        """Whether they are too many for a cycle, of a GoPro, or EXIF of less than a
+        step: auto exposure.
         """
         if self.source == EXIF and max(self.ev) - min(self.ev) < exposure.MIN_STEP:
+            return True
+        if self.source == GOPRO:
             return True
         return len(exposure.brackets_by_ev(self.ev)[1]) > exposure.MAX_CYCLE
 
@@ -58,7 +61,7 @@ class GivenExposures:
 
 def given_exposures(footage: Footage, count: int) -> GivenExposures | None:
     """The exposures of the first `count` frames; None where none are written down, or
-    the EXIF of all frames has the same.
+    metadata give all of these frames the same.
 
     InputError for a list that is not understood, or lacks one of these frames.
     """
@@ -72,10 +75,17 @@ def given_exposures(footage: Footage, count: int) -> GivenExposures | None:
             for i, source in enumerate(sources)
         ]
         return GivenExposures(path.name, known)
-    if footage.video:
-        return None
-    written = [read_exif_ev(path) for path in footage.cameras[0][:count]]
-    found = [ev for ev in written if ev is not None]
+    found = metadata_ev(footage, count)
     if len(found) < count or max(found) - min(found) < MIN_DRIFT_EV:
         return None
-    return GivenExposures(EXIF, found)
+    return GivenExposures(GOPRO if footage.video else EXIF, found)
+
+
+def metadata_ev(footage: Footage, count: int) -> list[float]:
+    """The EVs of those of the first `count` frames whose metadata have one."""
+    files = footage.cameras[0]
+    if footage.video:
+        written = read_gopro(files[0], max(footage.count, count))
+        return [] if written is None else written.ev[:count].tolist()
+    known = [read_exif_ev(path) for path in files[:count]]
+    return [ev for ev in known if ev is not None]
