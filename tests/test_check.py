@@ -312,7 +312,7 @@ def test_a_clip_that_is_long_for_one_scene_is_offered_segments() -> None:
 
 def test_frames_that_timestamps_miss_are_counted() -> None:
     good = good_facts()
-    found = judge(replace(good, file=replace(good.file, missing=2, interval_ms=(41.0, 84.0))))
+    found = judge(replace(good, file=replace(good.file, missing=2, interval_ms=(41.0, 42.0))))
     timing = [f.text for f in found if f.subject == "timing"]
     assert timing == ["2 frames are missing by the timestamps"]
 
@@ -329,6 +329,11 @@ def test_timestamps_of_a_list_are_read(tmp_path: Path) -> None:
     even = [40 * t for t in range(FRAMES + 1)]
     file, found = timing(even[:4] + even[5:])
     assert file.missing == 1 and found == ["1 frame is missing by the timestamps"]
+    assert file.frame_ms == 40 and file.interval_ms == (40, 40)
+    uneven = np.cumsum([40, 68] * 7).tolist()
+    file, found = timing(uneven[:4] + uneven[6:])  # two frames are missing
+    assert file.missing == 2 and found[0].startswith("2 frames are missing")
+    assert found[1] == "variable frame rate: 40 to 68 ms between frames"
     file, found = timing([*even[:4], even[3], *even[5:FRAMES]])
     sentence = "the timestamp_ns of frame 004.png is not above that of frame 003.png"
     assert file.interval_ms is None and found == [f"{sentence}; frames are taken as evenly spaced"]

@@ -65,6 +65,18 @@ def test_timestamps_that_show_no_times_are_named(
     assert times(work) == list(range(12))
 
 
+def test_a_rate_that_varies_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    ms = np.cumsum([20, 50, 30, 90] * 3)
+    lines = [f"{t:03d}.png,0,{time}000000" for t, time in enumerate(ms)]
+    (tmp_path / "clip").mkdir()
+    (tmp_path / "clip/exposures.csv").write_text("\n".join(["file,ev,timestamp_ns", *lines]))
+    work = work_on(tmp_path, clip([0], frames=12))
+    printed = " ".join(capsys.readouterr().err.split())
+    sentence = "frames: variable frame rate: 20 to 90 ms from frame to frame"
+    assert f"{sentence}; all count as evenly spaced" in printed
+    assert times(work) == list(range(12))
+
+
 def test_without_a_gap_frames_are_evenly_spaced(tmp_path: Path) -> None:
     work = work_on(tmp_path, clip(EVS, frames=27))
     exposure_step(work)

@@ -121,6 +121,12 @@ def test_a_frame_of_every_second_one_is_twice_as_long(share: float | Literal["au
     assert one == Shutter(0.25, (0.5,)) and two == Shutter(0.125, (0.25,))
 
 
+def test_a_readout_counts_in_the_time_from_frame_to_frame() -> None:
+    """Of a folder by timestamps, whatever rate it plays at."""
+    found = shutter_for(10.0, 0.0, timing([0.0], fps=24.0, frame_seconds=0.1))
+    assert found is not None and found.readout == pytest.approx(0.1)
+
+
 @pytest.mark.parametrize(
     ("known", "problem"),
     [

@@ -20,9 +20,10 @@ class FileFacts:
     fps: float
     bits: int
     kind: str  # recorded, linear, hlg, pq
-    # milliseconds: the shortest and longest time between frames, by timestamps; None
-    # without these
+    # milliseconds: the shortest and longest time from frame to frame, by timestamps,
+    # where none are missing; None without timestamps
     interval_ms: tuple[float, float] | None
+    frame_ms: float | None = None  # the usual one of these; None: by `fps`
     missing: int = 0  # frames by these timestamps
     timestamps_problem: str = ""  # why a list does not show the times, in words
     bars: str = ""  # what `prepare` does with black bars, in words

@@ -12,7 +12,12 @@ from hdr_nsff.core.video import frame_times, video_info
 from hdr_nsff.footage.exposure_lists import row_of
 from hdr_nsff.footage.footage import Footage
 from hdr_nsff.footage.ingest import MAX_FRAMES, read_frames
-from hdr_nsff.footage.timestamps import frame_gaps, read_timestamps, timestamps_problem
+from hdr_nsff.footage.timestamps import (
+    frame_gaps,
+    read_timestamps,
+    timestamps_problem,
+    usual_gap,
+)
 
 
 def describe_file(footage: Footage) -> FileFacts:
@@ -66,9 +71,12 @@ def measure_timing(footage: Footage) -> dict[str, Any]:
     known = np.array(seconds, np.float64)
     if len(known) < 2:
         return {"interval_ms": None}
-    steps = frame_gaps(seconds)
-    gaps = np.diff(known) * 1000
+    usual, steps = usual_gap(seconds), frame_gaps(seconds)
+    if steps is None:
+        steps = np.ones(len(known) - 1)
+    gaps = np.diff(known) / steps * 1000
     return {
         "interval_ms": (round(float(gaps.min()), 2), round(float(gaps.max()), 2)),
-        "missing": 0 if steps is None else round(float((steps - 1).sum())),
+        "frame_ms": None if usual is None else round(1000 * usual, 2),
+        "missing": round(float((steps - 1).sum())),
     }

@@ -241,7 +241,7 @@ def judge_shutter(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
         yield Finding("note", "shutter", text)
         return
     readout, error = facts.camera.readout
-    ms = 1000 / facts.file.fps
+    ms = facts.file.frame_ms or 1000 / facts.file.fps
     if readout < max(tuning.min_readout, 2 * error):
         most = max(tuning.min_readout, readout + 2 * error)
         text = f"no rolling shutter is seen (less than {most:.0%} of the time between frames)"
@@ -299,7 +299,7 @@ def judge_file(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
         text = f"{many} missing by the timestamps"
         advice = "`prepare` leaves gaps in time; use a faster card, or record at a constant rate"
         yield Finding("warning", "timing", text, advice)
-    elif file.interval_ms is not None:
+    if file.interval_ms is not None:
         shortest, longest = file.interval_ms
         if longest > tuning.max_interval_ratio * shortest:
             text = f"variable frame rate: {shortest:.0f} to {longest:.0f} ms between frames"

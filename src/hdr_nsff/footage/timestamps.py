@@ -65,6 +65,16 @@ def timestamps_problem(seconds: Sequence[float | None], names: Sequence[str]) ->
     return None
 
 
+def variable_rate(seconds: Sequence[float | None]) -> str | None:
+    """That the frame rate varies as a whole, in words; None where it does not, or
+    timestamps do not show it. `seconds` (T,) of the frames in order.
+    """
+    if usual_gap(seconds) is None or frame_gaps(seconds) is not None:
+        return None
+    gaps = np.diff(np.array(seconds, np.float64)) * 1000
+    return f"variable frame rate: {gaps.min():.0f} to {gaps.max():.0f} ms from frame to frame"
+
+
 def usual_gap(seconds: Sequence[float | None], stride: int = 1) -> float | None:
     """Seconds from one frame of the footage to the next, of those that are not longer
     because frames are missing; None where timestamps do not show it.

@@ -11,6 +11,7 @@ from hdr_nsff.footage.timestamps import (
     read_timestamps,
     timestamps_problem,
     usual_gap,
+    variable_rate,
 )
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.scene.manifest import FrameEntry
@@ -37,6 +38,7 @@ def leave_gaps(work: Work, entries: list[FrameEntry], seconds: list[float | None
         if written:
             known = [seconds_of(work, entries[k], written) for k in line]
             problems.append(timestamps_problem(known, [entries[k].source for k in line]))
+        problems.append(variable_rate(known))
         found.append(frame_gaps(known, stride))
     if problem := next(filter(None, problems), None):
         say(f"frames: {problem}; all count as evenly spaced")

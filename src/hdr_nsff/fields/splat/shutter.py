@@ -89,7 +89,10 @@ def shutter_for(readout_ms: float, share: Share, timing: Timing) -> Shutter | No
     elif share:
         shares = tuple(share * time for time in relative_times(timing))
     open_for = tuple(own / timing.stride for own in shares)
-    return Shutter(readout_ms * 1e-3 * timing.fps, open_for)
+    interval = 1 / timing.fps
+    if timing.frame_seconds is not None:
+        interval = timing.frame_seconds * timing.stride
+    return Shutter(readout_ms * 1e-3 / interval, open_for)
 
 
 def known_shares(timing: Timing) -> tuple[float, ...]:
