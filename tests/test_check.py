@@ -19,6 +19,7 @@ from hdr_nsff.check.measure import measure_clip
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import read_image, write_png
 from hdr_nsff.core.video import write_video
+from hdr_nsff.footage.footage import open_footage
 from hdr_nsff.footage.frame_files import CHECK_PICTURE, frame_files
 from hdr_nsff.footage.gpmf import GoProFrames
 from hdr_nsff.geometry.poses import Poses
@@ -36,6 +37,11 @@ def clip_of(folder: Path, radiance: Callable[[int], np.ndarray], evs: list[float
     return folder
 
 
+def measured(clip: Path) -> tuple[ClipFacts, np.ndarray, list[int]]:
+    """The facts of footage, its small frames, and their brackets."""
+    return measure_clip(open_footage(clip))
+
+
 def still_scene(t: int) -> np.ndarray:
     """Radiance that the toy scene has at time 0, without its moving card."""
     del t
@@ -49,7 +55,7 @@ def test_an_alternating_clip_with_parallax_is_fit_for_everything(
     scene = ToyScene(WIDTH, HEIGHT)
     evs = [EV[t % 3] - 1 for t in range(FRAMES)]
     clip = clip_of(tmp_path / "clip", lambda t: scene.see(float(t))[0], evs)
-    check(CheckConfig(clip, tmp_path / "seen.png", json=True))
+    check(CheckConfig(clip, picture=tmp_path / "seen.png", json=True))
     document = json.loads(capsys.readouterr().out)
     assert document["works"]["HDR"] == "yes"
     assert document["works"]["new viewpoints"].startswith("yes")
@@ -61,7 +67,7 @@ def test_an_alternating_clip_with_parallax_is_fit_for_everything(
 
 
 def test_a_tripod_with_one_exposure_has_neither_hdr_nor_viewpoints(tmp_path: Path) -> None:
-    facts, _, _ = measure_clip(clip_of(tmp_path, still_scene, [0.0] * FRAMES))
+    facts, _, _ = measured(clip_of(tmp_path, still_scene, [0.0] * FRAMES))
     assert facts.camera.motion == "tripod" and facts.exposure.cycle == 1
     works = outlook(facts)
     assert works["HDR"].startswith("no") and works["new viewpoints"].startswith("no")
@@ -78,7 +84,7 @@ def test_no_lens_is_looked_for_where_turns_alone_explain_most(
     looked_for = []
     monkeypatch.setattr(measure, "find_motion", lambda *_: ("parallax", share))
     monkeypatch.setattr(measure, "measure_lens", lambda *_: looked_for.append(share))
-    facts, _, _ = measure_clip(clip_of(tmp_path, still_scene, [0.0] * 4))
+    facts, _, _ = measured(clip_of(tmp_path, still_scene, [0.0] * 4))
     assert facts.camera.lens is None and facts.camera.rotation_share == share
     assert looked_for == ([share] if share < 0.7 else [])
 
@@ -100,7 +106,7 @@ def test_lines_are_straight_only_where_no_lens_explains_the_frames_better(
 
 def test_auto_exposure_is_told_from_a_locked_one(tmp_path: Path) -> None:
     drifting = [0.1 * t - 0.6 for t in range(FRAMES)]
-    facts, _, _ = measure_clip(clip_of(tmp_path, still_scene, drifting))
+    facts, _, _ = measured(clip_of(tmp_path, still_scene, drifting))
     assert facts.exposure.cycle == 1
     assert facts.exposure.drift_ev == pytest.approx(1.1, abs=0.15)
     assert any("auto exposure" in finding.text for finding in judge(facts))
@@ -112,7 +118,7 @@ def test_bands_of_mains_flicker_are_found(tmp_path: Path) -> None:
     def flickering(t: int) -> np.ndarray:
         return still_scene(t) * (1 + 0.1 * np.sin(2 * np.pi * (4 * rows + 0.3 * t)))
 
-    facts, _, _ = measure_clip(clip_of(tmp_path, flickering, [0.0] * FRAMES))
+    facts, _, _ = measured(clip_of(tmp_path, flickering, [0.0] * FRAMES))
     assert facts.exposure.banding_ev == pytest.approx(0.24, abs=0.1)  # of a difference of two
     assert any(finding.subject == "flicker" for finding in judge(facts))
 
@@ -121,7 +127,7 @@ def test_a_cut_is_found(tmp_path: Path) -> None:
     def cut(t: int) -> np.ndarray:
         return still_scene(t) if t < 5 else still_scene(t)[:, ::-1]
 
-    facts, _, _ = measure_clip(clip_of(tmp_path, cut, [0.0] * FRAMES))
+    facts, _, _ = measured(clip_of(tmp_path, cut, [0.0] * FRAMES))
     assert facts.camera.cuts == (5,)
 
 
@@ -133,9 +139,9 @@ def test_a_blurred_long_exposure_is_found(tmp_path: Path) -> None:
         return np.mean([np.roll(picture, k, 1) for k in range(-6, 7)], 0)
 
     evs = [0.0, -2.0] * (FRAMES // 2)
-    facts, _, _ = measure_clip(clip_of(tmp_path / "a", blurred, evs))
+    facts, _, _ = measured(clip_of(tmp_path / "a", blurred, evs))
     assert facts.camera.long_sharpness is not None and facts.camera.long_sharpness < 0.8
-    facts, _, _ = measure_clip(clip_of(tmp_path / "b", still_scene, evs))
+    facts, _, _ = measured(clip_of(tmp_path / "b", still_scene, evs))
     assert facts.camera.long_sharpness is not None and facts.camera.long_sharpness > 0.9
 
 
@@ -144,7 +150,7 @@ def test_given_exposures_are_taken_as_they_are(tmp_path: Path) -> None:
     clip = clip_of(tmp_path, still_scene, evs)
     rows = [f"{t},{ev}" for t, ev in enumerate(evs)]
     (clip / "exposures.csv").write_text("\n".join(["frame,ev", *rows]))
-    facts, _, brackets = measure_clip(clip)
+    facts, _, brackets = measured(clip)
     assert facts.exposure.given == "exposures.csv" and brackets == [0] * 8  # as `prepare`
     assert facts.exposure.given_drift_ev == 7 and not facts.exposure.contradictions
     assert outlook(facts)["HDR"] == "yes"
@@ -152,10 +158,10 @@ def test_given_exposures_are_taken_as_they_are(tmp_path: Path) -> None:
     assert exposure.level == "good" and "range over 7.0 EV, in no cycle" in exposure.text
     # rows in any order, but all of them
     (clip / "exposures.csv").write_text("\n".join(["frame,ev", *rows[::-1]]))
-    assert measure_clip(clip)[0].exposure == facts.exposure
+    assert measured(clip)[0].exposure == facts.exposure
     (clip / "exposures.csv").write_text("\n".join(["frame,ev", *rows[:-1]]))
     with pytest.raises(InputError, match="no row for frame"):
-        measure_clip(clip)
+        measured(clip)
 
 
 def test_given_exposures_that_do_not_change_are_no_alternation() -> None:
@@ -170,7 +176,7 @@ def listed(clip: Path, evs: list[float]) -> list[Finding]:
     """The findings on the exposure of a clip whose list says `evs`."""
     rows = [f"{t},{ev}" for t, ev in enumerate(evs)]
     (clip / "exposures.csv").write_text("\n".join(["frame,ev", *rows]))
-    facts, _, _ = measure_clip(clip)
+    facts, _, _ = measured(clip)
     works = Finding("note", "HDR", outlook(facts)["HDR"])
     return [works, *(f for f in judge(facts) if f.subject == "exposure")]
 
@@ -220,7 +226,7 @@ def test_exposures_that_a_gopro_wrote_count(
     write_video(tmp_path / "gopro.mp4", frames)
     written = GoProFrames(0.01 * 2**drift, np.full(FRAMES, 100.0))
     monkeypatch.setattr(given, "read_gopro", lambda path, count: written)
-    facts, _, brackets = measure_clip(tmp_path / "gopro.mp4")
+    facts, _, brackets = measured(tmp_path / "gopro.mp4")
     assert facts.exposure.given == "GoPro's metadata" and brackets == [0] * FRAMES
     assert facts.exposure.given_drift_ev == pytest.approx(1.1) and facts.exposure.ev == (0.0,)
     assert not facts.exposure.contradictions
@@ -245,7 +251,7 @@ def good_facts() -> ClipFacts:
 
 def test_a_frame_that_is_missing_from_the_cycle_is_found(tmp_path: Path) -> None:
     evs = [EV[t % 3] - 1 for t in range(16) if t != 7]
-    facts, _, brackets = measure_clip(clip_of(tmp_path, still_scene, evs))
+    facts, _, brackets = measured(clip_of(tmp_path, still_scene, evs))
     assert facts.exposure.missing_before == (7,)
     assert brackets == [t % 3 for t in range(16) if t != 7]
 
@@ -323,7 +329,7 @@ def test_timestamps_of_a_list_are_read(tmp_path: Path) -> None:
     def timing(ms: list[object]) -> tuple[FileFacts, list[str]]:
         rows = [f"{t},0,{time}000000" for t, time in enumerate(ms)]
         (clip / "exposures.csv").write_text("\n".join(["frame,ev,timestamp_ns", *rows]))
-        facts, _, _ = measure_clip(clip)
+        facts, _, _ = measured(clip)
         return facts.file, [f.text for f in judge(facts) if f.subject == "timing"]
 
     even = [40 * t for t in range(FRAMES + 1)]
@@ -343,12 +349,63 @@ def test_timestamps_of_a_list_are_read(tmp_path: Path) -> None:
 
 def test_bad_input_is_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
-        check(CheckConfig(tmp_path / "missing.mp4", tmp_path / "a.png"))
+        check(CheckConfig(tmp_path / "missing.mp4", picture=tmp_path / "a.png"))
     with pytest.raises(InputError, match=r"ends in \.png"):
-        check(CheckConfig(tmp_path, tmp_path / "a.jpg"))
+        check(CheckConfig(tmp_path, picture=tmp_path / "a.jpg"))
     (tmp_path / "notes.png").write_text("mine")
     with pytest.raises(InputError, match="exists and is no picture"):
-        check(CheckConfig(tmp_path, tmp_path / "notes.png"))
+        check(CheckConfig(tmp_path, picture=tmp_path / "notes.png"))
     black = clip_of(tmp_path / "black", lambda t: np.zeros((HEIGHT, WIDTH, 3)), [0.0] * 4)
     with pytest.raises(InputError, match="all frames are black"):
-        check(CheckConfig(black, tmp_path / "b.png"))
+        check(CheckConfig(black, picture=tmp_path / "b.png"))
+
+
+def rig_of(folder: Path, evs: dict[str, float], count: int = 6) -> Path:
+    """Cameras beside each other before the toy scene, each with its exposure."""
+    scene = ToyScene(WIDTH, HEIGHT)
+    for k, (name, ev) in enumerate(evs.items()):
+        clip_of(folder / name, lambda t, k=k: scene.see(t + 0.2 * k)[0], [ev] * count)  # type: ignore[misc]
+    return folder
+
+
+def test_all_cameras_of_a_rig_are_looked_at_for_their_exposure(tmp_path: Path) -> None:
+    facts, _, _ = measured(rig_of(tmp_path / "a", {"a": -3.0, "b": -1.0, "c": -3.0}))
+    assert [camera.name for camera in facts.each_camera] == ["a", "b", "c"]
+    levels = [camera.level_ev for camera in facts.each_camera]
+    assert levels == pytest.approx([0, 2, 0], abs=0.4)
+    found = {f.text: f.level for f in judge(facts) if f.subject in ("cameras", "exposure")}
+    assert found.popitem()[0].startswith("movement, lens and shutter are measured of the first of")
+    ((text, level),) = found.items()
+    assert text.startswith("the 3 cameras are exposed differently") and level == "good"
+    assert outlook(facts)["HDR"] == "yes"
+    alike, _, _ = measured(rig_of(tmp_path / "b", {"a": -1.0, "b": -1.0}))
+    assert outlook(alike)["HDR"].startswith("no")
+    texts = [f.text for f in judge(alike) if f.subject == "cameras"]
+    assert texts[0] == "the 2 cameras are exposed alike (by brightness)"
+
+
+def test_a_list_that_one_camera_contradicts_is_reported(tmp_path: Path) -> None:
+    folder = rig_of(tmp_path, {"a": -1.0, "b": -1.0}, FRAMES)
+    rows = [f"a/{t:03d}.png,0" for t in range(FRAMES)]
+    rows += [f"b/{t:03d}.png,{-2 * (t % 2)}" for t in range(FRAMES)]
+    (folder / "exposures.csv").write_text("\n".join(["file,ev", *rows]))
+    facts, _, _ = measured(folder)
+    assert outlook(facts)["HDR"].startswith("unknown: exposures.csv")
+    (finding,) = [f for f in judge(facts) if "disagree: " in f.text]
+    assert finding.text.startswith("b: exposures.csv and the pixels disagree: exposure steps of")
+
+
+def test_tracks_of_one_camera_are_compared(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, ev in (("bright", -1.0), ("dark", -3.0)):
+        clip_of(tmp_path / "clip" / name, still_scene, [ev] * 8)
+    tracks = ("bright", "dark")
+    check(CheckConfig(tmp_path / "clip", tmp_path / "seen.png", True, tracks))
+    document = json.loads(capsys.readouterr().out)
+    assert document["works"]["HDR"] == "yes"
+    assert document["works"]["new viewpoints"].startswith("no: the camera stands still")
+    texts = [f["text"] for f in document["findings"] if f["subject"] == "tracks"]
+    assert texts[0].startswith("the 2 tracks are exposed differently, by up to ")
+    dark = document["facts"]["each_camera"][1]
+    assert dark["level_ev"] == pytest.approx(-2, abs=0.2)

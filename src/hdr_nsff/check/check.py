@@ -18,8 +18,9 @@ from hdr_nsff.check.measure import measure_clip
 from hdr_nsff.check.picture import MARKS, draw
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import writing_to
-from hdr_nsff.footage.footage import open_footage
+from hdr_nsff.footage.footage import Footage, open_footage
 from hdr_nsff.footage.frame_files import CHECK_PICTURE
+from hdr_nsff.footage.tracks import open_tracks
 
 PNG_START = b"\x89PNG"
 WIDTH = 100  # characters of a line
@@ -40,13 +41,17 @@ class CheckConfig:
     """
     json: bool = False
     """Print facts and findings as JSON instead of sentences."""
+    same_camera: tuple[str, str] | None = None
+    """Two tracks of one camera in the folder CLIP, as for `prepare`."""
 
 
 def check(config: CheckConfig) -> Path:
     """The verb: the picture that was written."""
     picture = config.picture or Path(f"{config.clip.resolve().stem}{CHECK_PICTURE}")
-    check_place(picture, config.clip)
-    facts, video, brackets = measure_clip(config.clip)
+    check_place(picture)
+    footage = open_clip(config)
+    check_no_frame(picture, footage)
+    facts, video, brackets = measure_clip(footage)
     findings, works = judge(facts), outlook(facts)
     if config.json:
         document = {
@@ -66,18 +71,27 @@ def check(config: CheckConfig) -> Path:
     return picture
 
 
-def check_place(picture: Path, clip: Path) -> None:
-    """InputError where the picture is none, or would replace something else, such as a
-    frame of the clip.
-    """
+def open_clip(config: CheckConfig) -> Footage:
+    """The footage; InputError where it is not understood."""
+    if config.same_camera is not None:
+        return open_tracks(config.clip, config.same_camera)
+    return open_footage(config.clip)
+
+
+def check_place(picture: Path) -> None:
+    """InputError where the picture is none, or would replace something else."""
     if picture.suffix.lower() != ".png":
         raise InputError(f"--picture {picture}: give a name that ends in .png")
     if picture.is_dir():
         raise InputError(f"--picture {picture}: is a folder; name a file")
     if picture.is_file() and picture.read_bytes()[:4] != PNG_START:
         raise InputError(f"--picture {picture}: exists and is no picture; name another file")
+
+
+def check_no_frame(picture: Path, footage: Footage) -> None:
+    """InputError where the picture would replace a frame of the clip."""
     if picture.is_file() and not picture.name.endswith(CHECK_PICTURE):
-        frames = [frame for files in open_footage(clip).cameras for frame in files]
+        frames = [frame for files in footage.cameras for frame in files]
         if picture.resolve() in [frame.resolve() for frame in frames]:
             raise InputError(f"--picture {picture}: is a frame of the clip; name another file")
 

@@ -14,7 +14,7 @@ class FileFacts:
 
     name: str
     frames: int  # of one camera; 0: unknown
-    cameras: int
+    cameras: int  # or tracks of one camera
     width: int  # as players show it, without black bars, pixels
     height: int
     fps: float
@@ -28,6 +28,7 @@ class FileFacts:
     timestamps_problem: str = ""  # why a list does not show the times, in words
     bars: str = ""  # what `prepare` does with black bars, in words
     interlaced: bool = False  # by the marks of its frames
+    same_camera: bool = False  # the `cameras` are tracks of one
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,19 @@ class ExposureFacts:
     color_drift_ev: float = 0.0  # the same of red or blue against green
     missing_before: tuple[int, ...] = ()  # frames before which the cycle skips some
     given_drift_ev: float = 0.0  # range by which given exposures leave their cycle
+    contradictions: tuple[str, ...] = ()  # of given exposures and pixels, sentences
+
+
+@dataclass(frozen=True)
+class CameraExposure:
+    """The exposures of one of several cameras, or of a track of one."""
+
+    name: str  # of its folder or file
+    cycle: int  # frames; 1: no alternation
+    # EV above the first camera, given or under a gamma of 2.2; None: unknown
+    level_ev: float | None
+    white_share: float  # of its darkest exposure
+    black_share: float  # of its brightest
     contradictions: tuple[str, ...] = ()  # of given exposures and pixels, sentences
 
 
@@ -82,3 +96,4 @@ class ClipFacts:
     looked_at: int  # frames, from the start on
     exposure: ExposureFacts
     camera: CameraFacts
+    each_camera: tuple[CameraExposure, ...] = ()  # where there are several

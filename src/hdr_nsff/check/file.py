@@ -45,6 +45,7 @@ def describe_file(footage: Footage) -> FileFacts:
         kind=kind,
         bars=footage.bars.sentence() if footage.bars else "",
         interlaced=footage.interlaced,
+        same_camera=footage.same_camera,
         **measure_timing(footage),
     )
 

@@ -11,6 +11,7 @@ from hdr_nsff.check.facts import ClipFacts, ExposureFacts
 from hdr_nsff.footage.footage import INTERLACED, deinterlacing
 from hdr_nsff.prepare.length import offered_segments
 from hdr_nsff.prepare.work import PrepareConfig
+from hdr_nsff.radiometry.camera_brackets import MIN_CAMERA_STEP_EV
 from hdr_nsff.radiometry.exposure_cycle import MAX_CYCLE, MIN_STEP
 
 Level = Literal["good", "note", "warning", "problem"]
@@ -31,6 +32,8 @@ class FindingTuning:
     """From when on a measured number is worth a sentence; hand-chosen."""
 
     max_step_ev: float = 3.3  # between neighboring exposures: they must share mid-tones
+    # between cameras, which see different things, by brightness
+    min_camera_step_ev: float = MIN_CAMERA_STEP_EV
     max_drift_ev: float = 0.3  # auto exposure; locked clips measure up to 0.13
     max_color_drift_ev: float = 0.2  # of red or blue against green
     max_white: float = 0.01  # share of pixels that even the darkest exposure saturates
@@ -49,6 +52,7 @@ def judge(facts: ClipFacts, tuning: FindingTuning = FindingTuning()) -> list[Fin
     """Findings in the order in which a user decides."""
     return [
         *judge_exposure(facts, tuning),
+        *judge_cameras(facts, tuning),
         *judge_clipping(facts, tuning),
         *judge_camera(facts, tuning),
         *judge_file(facts, tuning),
@@ -81,10 +85,12 @@ def outlook(facts: ClipFacts) -> dict[str, str]:
         "tripod": "no: the camera stands still, so there is no depth",
         "unknown": "unknown: too few points match between distant frames",
     }[camera.motion]
-    if facts.file.cameras > 1:
-        views = "yes, between cameras that see the same (of them, only the first was looked at)"
-        if not varies:
-            hdr = "only if the cameras are exposed differently: only the first was looked at"
+    if facts.file.cameras > 1 and not facts.file.same_camera:
+        views = "yes, between cameras that see the same"
+    if any(camera.contradictions for camera in facts.each_camera):
+        hdr = f"unknown: {exposure.given} and the pixels disagree"
+    elif different_cameras(facts, FindingTuning()):
+        hdr = "yes"
     times = "yes" if not camera.cuts else "only within a shot: the clip has cuts"
     return {"HDR": hdr, "new viewpoints": views, "times between frames": times}
 
@@ -93,7 +99,10 @@ def judge_exposure(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]
     """The cycle, or what is there instead."""
     exposure = facts.exposure
     ordered = sorted(exposure.ev)
-    if exposure.given is not None:
+    one_each = different_cameras(facts, tuning) > 0 and ordered[-1] < MIN_STEP
+    if one_each and not exposure.contradictions:
+        pass  # `judge_cameras` says by how much they differ
+    elif exposure.given is not None:
         yield from judge_given(exposure, exposure.given, tuning)
     elif exposure.cycle > 1:
         levels = ", ".join(f"{value:.1f}" for value in ordered)
@@ -163,20 +172,61 @@ def jumps(exposure: ExposureFacts, tuning: FindingTuning) -> bool:
     return exposure.given_drift_ev > tuning.max_drift_ev and exposure.change_ev > MIN_STEP
 
 
+def judge_cameras(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
+    """How several cameras, or tracks of one, are exposed."""
+    count = len(facts.each_camera)
+    if not count:
+        return
+    what = "tracks" if facts.file.same_camera else "cameras"
+    lengths = [camera.cycle for camera in facts.each_camera]
+    span = different_cameras(facts, tuning)
+    by = facts.exposure.given or "brightness"
+    if len(set(lengths)) > 1:
+        text = f"the {what} disagree on the length of the exposure cycle: {lengths}"
+        yield Finding("warning", what, text, "list the exposures in exposures.csv")
+    elif span:
+        text = f"the {count} {what} are exposed differently, by up to {span:.1f} EV (by {by})"
+        yield Finding("good", what, text)
+    else:
+        yield Finding("note", what, f"the {count} {what} are exposed alike (by {by})")
+    for camera in facts.each_camera[1:]:
+        for sentence in camera.contradictions:
+            text = f"{camera.name}: {by} and the pixels disagree: {sentence}"
+            yield Finding("warning", what, text, "correct the exposures")
+    text = f"movement, lens and shutter are measured of the first of the {count} {what} only"
+    yield Finding("note", what, text)
+
+
+def different_cameras(facts: ClipFacts, tuning: FindingTuning) -> float:
+    """EV between the least and the most exposed of several cameras or tracks; 0 where
+    they are exposed alike.
+    """
+    levels = [c.level_ev for c in facts.each_camera if c.level_ev is not None]
+    span = max(levels, default=0.0) - min(levels, default=0.0)
+    least = tuning.min_camera_step_ev
+    if facts.exposure.given is not None or facts.file.same_camera:
+        least = MIN_STEP
+    return span if span >= least else 0.0
+
+
 def judge_clipping(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
     """What no exposure recorded."""
-    exposure = facts.exposure
+    exposure, several = facts.exposure, different_cameras(facts, tuning)
     darkest = exposure.ev.index(min(exposure.ev))
     brightest = exposure.ev.index(max(exposure.ev))
     white, black = exposure.white_share[darkest], exposure.black_share[brightest]
-    one = "the" if len(exposure.ev) == 1 else "even the darkest"
+    if several:
+        white = min(camera.white_share for camera in facts.each_camera)
+        black = min(camera.black_share for camera in facts.each_camera)
+    single = len(exposure.ev) == 1 and not several
+    one = "the" if single else "even the darkest"
     if white > tuning.max_white:
         text = f"{one} exposure saturates {white:.1%} of the picture"
         yield Finding("warning", "highlights", text, "add a darker exposure")
     else:
         yield Finding("good", "highlights", f"{one} exposure saturates {white:.1%} of the picture")
     if black > tuning.max_black:
-        one = "the" if len(exposure.ev) == 1 else "even the brightest"
+        one = "the" if single else "even the brightest"
         text = f"{one} exposure leaves {black:.1%} of the picture black"
         yield Finding("warning", "shadows", text, "add a brighter exposure")
 
@@ -199,7 +249,7 @@ def judge_camera(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
         did = "stands still" if camera.motion == "tripod" else "turns, or hardly moves"
         text = f"the camera {did}{why}"
         advice = "for new viewpoints, move sideways or in an arc; HDR and slow motion work as it is"
-        if facts.file.cameras > 1:
+        if facts.file.cameras > 1 and not facts.file.same_camera:
             text = f"the first of {facts.file.cameras} cameras {did}"
             advice = "for new viewpoints, the cameras have to see the same from different places"
         yield Finding("note", "camera", text, advice)
@@ -267,7 +317,7 @@ def judge_file(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
     }
     count = f"{file.frames} frames" if file.frames else "frames"
     if file.cameras > 1:
-        count = f"{file.cameras} cameras of {count}"
+        count = f"{file.cameras} {'tracks' if file.same_camera else 'cameras'} of {count}"
     size = f"{file.width} x {file.height}, {file.fps:.4g} a second"
     yield Finding("note", "file", f"{count} of {size}; {kinds[file.kind]}")
     if file.interlaced:

@@ -59,31 +59,48 @@ class GivenExposures:
         return float(np.ptp(left))
 
 
-def given_exposures(footage: Footage, count: int) -> GivenExposures | None:
-    """The exposures of the first `count` frames; None where none are written down, or
-    metadata give all of these frames the same.
+def given_exposures(footage: Footage, count: int) -> list[GivenExposures | None]:
+    """The exposures of the first `count` frames of every camera or track; None where
+    none are written down, or metadata give all of these frames the same.
 
     InputError for a list that is not understood, or lacks one of these frames.
     """
     table = read_exposure_csv(footage)
     if table is not None:
         path, rows = table
-        names = list(footage.files)
-        sources = [f"{names[0]}#{i}" if footage.video else names[i] for i in range(count)]
-        known = [
-            ev_in_list(path, rows, source, i, advice="add it, or rename the list to ignore it")
-            for i, source in enumerate(sources)
+        advice = "add it, or rename the list to ignore it"
+        return [
+            GivenExposures(
+                path.name,
+                [
+                    ev_in_list(path, rows, source, i, footage.same_camera, advice)
+                    for i, source in enumerate(frame_names(footage, camera, count))
+                ],
+            )
+            for camera in range(len(footage.cameras))
         ]
-        return GivenExposures(path.name, known)
-    found = metadata_ev(footage, count)
-    if len(found) < count or max(found) - min(found) < MIN_DRIFT_EV:
-        return None
-    return GivenExposures(GOPRO if footage.video else EXIF, found)
+    known = [metadata_ev(footage, camera, count) for camera in range(len(footage.cameras))]
+    all_known = [ev for own in known for ev in own]
+    complete = all(len(own) == count for own in known)
+    if not complete or max(all_known) - min(all_known) < MIN_DRIFT_EV:
+        return [None] * len(known)
+    source = GOPRO if footage.video else EXIF
+    return [GivenExposures(source, own) for own in known]
 
 
-def metadata_ev(footage: Footage, count: int) -> list[float]:
-    """The EVs of those of the first `count` frames whose metadata have one."""
-    files = footage.cameras[0]
+def frame_names(footage: Footage, camera: int, count: int) -> list[str]:
+    """The names of the first `count` frames of a camera, as in a list."""
+    files = [path.relative_to(footage.root).as_posix() for path in footage.cameras[camera]]
+    if footage.video:
+        return [f"{files[0]}#{number}" for number in range(count)]
+    return files[:count]
+
+
+def metadata_ev(footage: Footage, camera: int, count: int) -> list[float]:
+    """The EVs of those of the first `count` frames of a camera whose metadata have
+    one.
+    """
+    files = footage.cameras[camera]
     if footage.video:
         written = read_gopro(files[0], max(footage.count, count))
         return [] if written is None else written.ev[:count].tolist()

@@ -5,11 +5,11 @@ the cycle by brightness, SIFT matches on equalized frames, rotations that explai
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
 
+from hdr_nsff.check.cameras import measure_cameras
 from hdr_nsff.check.drift import drift_contradictions, measure_drift
 from hdr_nsff.check.facts import CameraFacts, CameraMotion, ClipFacts, ExposureFacts
 from hdr_nsff.check.file import describe_file
@@ -21,7 +21,7 @@ from hdr_nsff.core.progress import track
 from hdr_nsff.core.stack import spread_frames
 from hdr_nsff.footage.bars import with_bars
 from hdr_nsff.footage.cuts import find_cuts
-from hdr_nsff.footage.footage import open_footage
+from hdr_nsff.footage.footage import Footage
 from hdr_nsff.footage.frame_choice import check_frame_size
 from hdr_nsff.footage.ingest import read_frames
 from hdr_nsff.priors.poses.estimate import PosesTuning, believed_share, shaken_poses
@@ -60,19 +60,19 @@ class CheckTuning:
 
 
 def measure_clip(
-    clip: Path, tuning: CheckTuning = CheckTuning()
+    footage: Footage, tuning: CheckTuning = CheckTuning()
 ) -> tuple[ClipFacts, np.ndarray, list[int]]:
     """The facts of a clip, its small frames (T, H, W, 3), and their brackets (T,).
 
-    Of several cameras, the first is looked at. InputError for footage that cannot be
-    read, and where all is black or white.
+    Of several cameras or tracks, the first is looked at, and the exposures of all.
+    InputError for footage that cannot be read, and where all is black or white.
     """
-    footage = with_bars(open_footage(clip))
+    clip, footage = footage.path, with_bars(footage)
     frames = read_frames(footage, 0, tuning.max_frames, 1, tuning.max_size)
     total = min(footage.count or tuning.max_frames, tuning.max_frames)
     pictures = []
     for frame in track(frames, "frames", total):
-        if frame.camera_id:
+        if frame.camera_id or frame.track:
             break
         pictures.append(frame.rgb)
     if len(pictures) < MIN_FRAMES:
@@ -84,7 +84,7 @@ def measure_clip(
     if nothing is not None:
         raise InputError(f"{clip}: all frames are {nothing}; check that it plays")
     file = describe_file(footage)
-    given = given_exposures(footage, len(video))
+    given = given_exposures(footage, len(video))[0]
     if given is not None:
         cycle, gaps = given.cycle()
     else:
@@ -99,6 +99,7 @@ def measure_clip(
         looked_at=len(video),
         exposure=measure_exposure(given, video, cycle, keypoints, gaps, tuning),
         camera=measure_camera(equalized, clipped, cycle, keypoints, following, scale, tuning),
+        each_camera=measure_cameras(footage, tuning.max_size, tuning.low, tuning.high),
     )
     return facts, video, cycle.brackets
 
