@@ -19,7 +19,7 @@ class FileFacts:
     height: int
     fps: float
     bits: int
-    kind: str  # recorded, linear, hlg, pq
+    kind: str  # recorded, linear, or the name of a transfer function that is undone
     # milliseconds: the shortest and longest time from frame to frame, by timestamps,
     # where none are missing; None without timestamps
     interval_ms: tuple[float, float] | None

@@ -10,7 +10,7 @@ import numpy as np
 from hdr_nsff.check.facts import FileFacts
 from hdr_nsff.core.video import frame_times, video_info
 from hdr_nsff.footage.exposure_lists import row_of
-from hdr_nsff.footage.footage import Footage
+from hdr_nsff.footage.footage import TRANSFER_NAMES, Footage
 from hdr_nsff.footage.ingest import MAX_FRAMES, read_frames
 from hdr_nsff.footage.timestamps import (
     frame_gaps,
@@ -23,7 +23,9 @@ from hdr_nsff.footage.timestamps import (
 def describe_file(footage: Footage) -> FileFacts:
     """The file's header, or the first frame of a folder."""
     first = footage.cameras[0][0]
-    kind = "linear" if footage.linear else (footage.transfer or "recorded")
+    kind = "linear" if footage.linear else "recorded"
+    if footage.transfer is not None:
+        kind = TRANSFER_NAMES[footage.transfer]
     frame = next(read_frames(footage, 0, 1, 1, MAX_FRAMES))
     height, width = frame.rgb.shape[:2]
     bits = 8

@@ -309,17 +309,18 @@ def judge_shutter(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
 def judge_file(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
     """Length, timing and tags."""
     file = facts.file
-    kinds = {
-        "hlg": f"HLG of {file.bits} bits, brought to linear light by its tags",
-        "pq": f"PQ of {file.bits} bits, brought to linear light by its tags",
-        "linear": "linear frames",
-        "recorded": f"{file.bits} bits",
-    }
+    match file.kind:
+        case "linear":
+            kind = "linear frames"
+        case "recorded":
+            kind = f"{file.bits} bits"
+        case _:
+            kind = f"{file.kind} of {file.bits} bits, brought to linear light by its tags"
     count = f"{file.frames} frames" if file.frames else "frames"
     if file.cameras > 1:
         count = f"{file.cameras} {'tracks' if file.same_camera else 'cameras'} of {count}"
     size = f"{file.width} x {file.height}, {file.fps:.4g} a second"
-    yield Finding("note", "file", f"{count} of {size}; {kinds[file.kind]}")
+    yield Finding("note", "file", f"{count} of {size}; {kind}")
     if file.interlaced:
         yield Finding("warning", "interlaced", INTERLACED, deinterlacing(file.name))
     if file.bars:

@@ -7,6 +7,7 @@ from __future__ import annotations
 import shlex
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -27,7 +28,22 @@ ACCEPTED = (
     "a video file, a folder of PNG, JPEG, TIFF, EXR or DNG frames, "
     "or a folder of such folders or videos (one per camera)"
 )
-TRANSFERS: dict[int, Transfer] = {16: "pq", 18: "hlg"}  # by their codes in H.273
+TaggedTransfer = Transfer | Literal["linear", "log100", "log316"]
+# transfer functions that are undone, by their codes in H.273
+TRANSFERS: dict[int, TaggedTransfer] = {
+    8: "linear",
+    9: "log100",
+    10: "log316",
+    16: "pq",
+    18: "hlg",
+}
+TRANSFER_NAMES: dict[TaggedTransfer, str] = {
+    "linear": "linear video",
+    "log100": "log video (100:1)",
+    "log316": "log video (316:1)",
+    "pq": "PQ",
+    "hlg": "HLG",
+}
 INTERLACED = "the video is interlaced: the odd and even rows of a frame show two moments"
 FOLDER_FPS = 24.0  # frames per second assumed for a folder of frames
 MAX_RATE_DIFFERENCE = 0.01  # of synchronized cameras: headers round the rate
@@ -70,7 +86,7 @@ class Footage:
     linear: bool  # EXR or DNG
     # gray that shows through transparent pixels; None: transparency is ignored
     over: float | None = None
-    transfer: Transfer | None = None  # of HDR video, by its tags
+    transfer: TaggedTransfer | None = None  # of HDR, log or linear video, by its tags
     same_camera: bool = False  # the `cameras` are tracks of one (`tracks.py`)
     bars: Bars = Bars()  # that are cut off the frames
     interlaced: bool = False  # of video, by the marks of its first frames

@@ -1,23 +1,24 @@
 """Linear light as recorded values: scaled into [0, 1] and encoded as x^(1/2.2), so that
 what follows sees one kind of recording.
 
-EXR and DNG are linear; they are scaled by one constant for the whole footage. HLG and
-PQ video is brought to linear light first, by its tags.
+EXR and DNG are linear; they are scaled by one constant for the whole footage. HLG, PQ,
+log and linear video is brought to linear light first, by its tags.
 """
 
 from __future__ import annotations
 
 import functools
 from pathlib import Path
+from typing import assert_never
 
 import numpy as np
 
 from hdr_nsff.core.exr import REC709
+from hdr_nsff.footage.footage import TaggedTransfer
 from hdr_nsff.footage.still_frames import read_frame
 from hdr_nsff.maths.hdr_signal import (
     PEAK_NITS,
     REC2020,
-    Transfer,
     hlg_inverse_oetf,
     pq_decode,
     rgb_to_xyz,
@@ -32,11 +33,11 @@ def encode_light(light: np.ndarray) -> np.ndarray:
     return np.clip(light, 0, 1) ** np.float32(1 / GAMMA)
 
 
-def encode_signal(signal: np.ndarray, transfer: Transfer, rec2020: bool) -> np.ndarray:
-    """HDR signals (H, W, 3) in [0, 1] as linear Rec. 709 light, encoded as x^(1/2.2).
+def encode_signal(signal: np.ndarray, transfer: TaggedTransfer, rec2020: bool) -> np.ndarray:
+    """Signals (H, W, 3) in [0, 1] as linear Rec. 709 light, encoded as x^(1/2.2).
 
-    1 is the brightest scene light of HLG, and 1000 nits of PQ. Colors outside Rec. 709
-    are clipped.
+    1 is the brightest light of HLG, log and linear signals, and 1000 nits of PQ. Colors
+    outside Rec. 709 are clipped.
     """
     codes = np.rint(np.clip(signal, 0, 1) * 65535).astype(np.uint16)  # as decoded
     light = light_table(transfer)[codes]
@@ -47,11 +48,30 @@ def encode_signal(signal: np.ndarray, transfer: Transfer, rec2020: bool) -> np.n
 
 
 @functools.cache
-def light_table(transfer: Transfer) -> np.ndarray:
+def light_table(transfer: TaggedTransfer) -> np.ndarray:
     """Light (65536,) float32 of the signals of 16 bits, 1 is the peak."""
     signal = np.linspace(0, 1, 65536)
-    light = pq_decode(signal) / PEAK_NITS if transfer == "pq" else hlg_inverse_oetf(signal)
+    match transfer:
+        case "pq":
+            light = pq_decode(signal) / PEAK_NITS
+        case "hlg":
+            light = hlg_inverse_oetf(signal)
+        case "log100":
+            light = log_light(signal, 2.0)
+        case "log316":
+            light = log_light(signal, 2.5)
+        case "linear":
+            light = signal
+        case _:
+            assert_never(transfer)
     return light.astype(np.float32)
+
+
+def log_light(signal: np.ndarray, decades: float) -> np.ndarray:
+    """Light of a logarithmic signal 1 + log10(light) / `decades` (H.273, table 3); the
+    signal 0 is all that is darker, and becomes 0.
+    """
+    return np.where(signal > 0, 10.0 ** (decades * (signal - 1)), 0.0)
 
 
 def linear_scale(files: list[Path]) -> float:

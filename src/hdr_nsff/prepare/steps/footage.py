@@ -12,6 +12,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import write_png
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage.cuts import find_cuts
+from hdr_nsff.footage.footage import TRANSFER_NAMES
 from hdr_nsff.footage.frame_choice import check_frame_size
 from hdr_nsff.footage.hold_out import HOLD_OUT, frames_between, hold_out_every
 from hdr_nsff.footage.ingest import read_frames
@@ -79,7 +80,7 @@ def frames_step(work: Work) -> StepResult:
     if work.footage.linear:
         note += "; linear frames, scaled by one constant and encoded as x^(1/2.2)"
     if work.footage.transfer is not None:
-        kind = work.footage.transfer.upper()
+        kind = TRANSFER_NAMES[work.footage.transfer]
         note += f"; {kind} by its tags, brought to linear light and encoded as x^(1/2.2)"
     if work.footage.bars:
         note += f"; {work.footage.bars.sentence()}"
