@@ -128,13 +128,14 @@ def test_a_track_of_metadata_is_found_in_its_file(tmp_path: Path) -> None:
         stream = container.add_stream("libx264", rate=25)
         stream.height, stream.width, stream.pix_fmt = 32, 48, "yuv420p"
         metadata = container.add_data_stream("bin_data")
-        metadata.metadata["handler_name"] = "GoPro MET"
+        metadata.metadata["handler_name"], metadata.time_base = "GoPro MET", TICK
         for _ in seconds:
             gray = np.full((32, 48, 3), 90, np.uint8)
             container.mux(stream.encode(av.VideoFrame.from_ndarray(gray, format="rgb24")))
         container.mux(stream.encode())
         written = av.Packet(packet(seconds, [100] * 4, [(1.0, 1.0, 2.0)]))
-        written.stream, written.pts, written.dts = metadata, 0, 0
+        written.stream, written.time_base = metadata, TICK
+        written.pts, written.dts, written.duration = 0, 0, 160
         container.mux(written)
     found = read_gopro(tmp_path / "a.mp4", 4)
     assert found is not None and found.seconds == pytest.approx(seconds)
