@@ -1,11 +1,13 @@
 """The exposures of single frames come back from a wall in closed form."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from wall import S_CURVE, SRGB, wall_view
+from wall import S_CURVE, SRGB, X, wall_view
 
+from hdr_nsff.radiometry import frame_exposures
 from hdr_nsff.radiometry.debevec import DebevecTuning, Samples
 from hdr_nsff.radiometry.estimate_response import estimate_response
 from hdr_nsff.radiometry.frame_exposures import (
@@ -13,6 +15,7 @@ from hdr_nsff.radiometry.frame_exposures import (
     drift_is_shared,
     drift_within_brackets,
     frame_log_exposures,
+    normal_equations,
     read_points,
     second_differences,
     steepness_factor,
@@ -152,8 +155,67 @@ def test_exposures_are_the_offsets_between_readings():
 
 
 def test_frames_of_one_bracket_are_smooth_in_time():
-    rows = second_differences(np.array([0, 1, 0, 1, 0, 1]))
+    rows = second_differences(np.array([0, 1, 0, 1, 0, 1])).toarray()
     assert rows.tolist() == [[1, 0, -2, 0, 1, 0], [0, 1, 0, -2, 0, 1]]
+    assert second_differences(np.array([0, 1, 0, 1])).shape == (0, 4)
+
+
+def test_the_normal_equations_are_those_of_all_readings():
+    """Against the same with the radiance of every point as an unknown, eliminated by
+    the Schur complement.
+    """
+    rng = np.random.default_rng(0)
+    frame = np.clip(np.arange(9)[:, None] + [0, -3, 1, 2], 0, 8)
+    weights, log_exposure = rng.uniform(0.1, 1, (2, 9, 4, 3))
+    matrix, right = normal_equations(weights, log_exposure, frame, 9)
+    dense, target = np.zeros((9, 9)), np.zeros(9)
+    for point in range(9):
+        for c in range(3):
+            w, z = weights[point, :, c], log_exposure[point, :, c]
+            of_frames = np.zeros((4, 9))
+            of_frames[np.arange(4), frame[point]] = 1
+            centered = of_frames - w @ of_frames / w.sum()
+            dense += of_frames.T @ (w[:, None] * centered)
+            target += of_frames.T @ (w * (z - w @ z / w.sum()))
+    np.testing.assert_allclose(matrix.toarray(), dense, atol=1e-12)
+    np.testing.assert_allclose(right, target, atol=1e-12)
+
+
+@pytest.mark.parametrize("cycle", [(1,), (0, 1, 2)])
+def test_exposures_are_those_of_a_dense_solve(cycle, monkeypatch):
+    """In which a dense term holds the mean at 0."""
+    views = drifting_views(S_CURVE, smooth_drift(1.0), cycle)
+    readings = read_points(views, np.random.default_rng(0))
+    brackets = np.arange(NUM) % len(cycle)
+    found = frame_log_exposures(readings, X, S_CURVE, brackets)
+
+    def dense_solve(matrix, right):
+        scale = np.median(matrix.diagonal())
+        return np.linalg.solve(matrix.toarray() + 1e-6 * scale, right)
+
+    monkeypatch.setattr(frame_exposures, "spsolve", dense_solve)
+    dense = frame_log_exposures(readings, X, S_CURVE, brackets)
+    np.testing.assert_allclose(found, dense, atol=1e-7)
+    assert found.mean() == pytest.approx(0, abs=1e-12)
+
+
+def test_work_grows_with_the_frames_alone():
+    """Of 6000 frames: a full matrix of them would take 288 MB."""
+    count = 6000
+    frame = np.clip(np.arange(count)[:, None] + [0, -24, 24], 0, count - 1)
+    rng = np.random.default_rng(0)
+    samples = Samples(
+        rng.uniform(0.2, 0.8, (count, 3, 3)),
+        np.ones((count, 3, 3), bool),
+        np.zeros((count, 3, 3), bool),
+    )
+    tracemalloc.start()
+    found = frame_log_exposures(
+        Readings(samples, frame, np.zeros((count, 2))), X, S_CURVE, np.arange(count) % 2
+    )
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert np.isfinite(found).all() and peak < 100e6
 
 
 def test_points_are_read_in_their_own_frame_and_its_neighbors():

@@ -14,6 +14,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.sparse import csc_matrix, identity
+from scipy.sparse.linalg import spsolve
 
 from hdr_nsff.core.progress import track
 from hdr_nsff.core.stack import LazyList
@@ -127,14 +129,17 @@ def frame_log_exposures(
     weight = np.where(valid, z**2 * np.clip((1 - z) / SHOULDER_WIDTH, 0, 1), 0.0)
     weight = np.where((weight > 0).sum(1, keepdims=True) >= 2, weight, 0.0)
     differences = second_differences(brackets)
+    roughness = differences.T @ differences
     exposures, robust = np.zeros(len(brackets)), np.ones_like(weight)
     for _ in range(tuning.rounds):
         weights = weight * robust
         matrix, right = normal_equations(weights, log_exposure, readings.frame, len(brackets))
-        scale = max(float(np.median(np.diag(matrix))), 1e-9)
-        matrix = matrix + tuning.smoothness * scale * differences.T @ differences
-        matrix = matrix + 1e-6 * scale  # the mean is 0
-        exposures = np.linalg.solve(matrix + 1e-9 * scale * np.eye(len(brackets)), right)
+        scale = max(float(np.median(matrix.diagonal())), 1e-9)
+        matrix = matrix + tuning.smoothness * scale * roughness
+        # the mean is left open by all but this, and set to 0
+        matrix = matrix + 1e-9 * scale * identity(len(brackets))
+        exposures = spsolve(csc_matrix(matrix), right)
+        exposures = exposures - exposures.mean()
         at_one = log_exposure - exposures[readings.frame][..., None]
         total = np.maximum(weights.sum(1, keepdims=True), 1e-12)
         radiance = (weights * at_one).sum(1, keepdims=True) / total
@@ -147,9 +152,9 @@ def frame_log_exposures(
 
 def normal_equations(
     weights: np.ndarray, log_exposure: np.ndarray, frame: np.ndarray, num_frames: int
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[csc_matrix, np.ndarray]:
     """The normal equations (T, T), (T,) of the frames' log exposures, the points' own
-    radiance eliminated.
+    radiance eliminated. Only frames that share a point are linked.
 
     `weights` and `log_exposure` (P, K, 3) of readings in `frame` (P, K).
     """
@@ -157,26 +162,32 @@ def normal_equations(
     mean = (weights * log_exposure).sum(1, keepdims=True) / total
     target = (weights * (log_exposure - mean)).sum(-1)
     right = np.bincount(frame.ravel(), target.ravel(), num_frames)
-    matrix = np.diag(np.bincount(frame.ravel(), weights.sum(-1).ravel(), num_frames))
+    reach = int((frame.max(1) - frame.min(1)).max(initial=0))
+    width = 2 * reach + 1
+    band = np.zeros(num_frames * width)  # (T, width): row t holds columns t - reach on
     share = weights / np.sqrt(total)
     for a in range(frame.shape[1]):
-        cells = frame[:, a, None] * num_frames + frame
+        cells = frame[:, a, None] * width + frame - frame[:, a, None] + reach
         products = (share[:, a, None] * share).sum(-1)
-        sums = np.bincount(cells.ravel(), products.ravel(), num_frames**2)
-        matrix = matrix - sums.reshape(num_frames, num_frames)
-    return matrix, right
+        band -= np.bincount(cells.ravel(), products.ravel(), len(band))
+    diagonal = np.arange(num_frames) * width + reach
+    band[diagonal] += np.bincount(frame.ravel(), weights.sum(-1).ravel(), num_frames)
+    cells = np.flatnonzero(band)
+    rows = cells // width
+    columns = rows + cells % width - reach
+    return csc_matrix((band[cells], (rows, columns)), (num_frames, num_frames)), right
 
 
-def second_differences(brackets: np.ndarray) -> np.ndarray:
+def second_differences(brackets: np.ndarray) -> csc_matrix:
     """The matrix (N, T) of second differences of frames of one bracket, in order."""
-    rows = []
+    triples = []
     for bracket in np.unique(brackets):
         own = np.flatnonzero(brackets == bracket)
-        for before, at, after in zip(own, own[1:], own[2:], strict=False):
-            row = np.zeros(len(brackets))
-            row[[before, at, after]] = 1.0, -2.0, 1.0
-            rows.append(row)
-    return np.array(rows).reshape(-1, len(brackets))
+        triples += list(zip(own, own[1:], own[2:], strict=False))
+    columns = np.array(triples, int).reshape(-1, 3)
+    rows = np.repeat(np.arange(len(columns)), 3)
+    values = np.tile([1.0, -2.0, 1.0], len(columns))
+    return csc_matrix((values, (rows, columns.ravel())), (len(columns), len(brackets)))
 
 
 def drift_within_brackets(exposures: np.ndarray, brackets: np.ndarray) -> np.ndarray:

@@ -132,11 +132,15 @@ def drift_of_frames(work: Work, drift: np.ndarray | None) -> dict[int, float]:
         return {f.index: f.drift for f in work.manifest.frames if f.drift is not None}
     if drift is None:
         return {}
+    brackets = np.array([f.bracket for f in work.train])
+    times = np.array([f.time for f in work.train])
+    of_bracket = {b: np.flatnonzero(brackets == b) for b in np.unique(brackets).tolist()}
     found = {}
     for f in work.manifest.frames:
-        same = [k for k, other in enumerate(work.train) if other.bracket == f.bracket]
-        times = [work.train[k].time for k in same]
-        found[f.index] = round(float(np.interp(f.time, times, drift[same])), 5)
+        if f.bracket not in of_bracket:
+            continue  # nothing was learned of its exposure
+        same = of_bracket[f.bracket]
+        found[f.index] = round(float(np.interp(f.time, times[same], drift[same])), 5)
     return found
 
 
