@@ -74,8 +74,8 @@ class ReconstructionTuning:
     long_lens_fov_degrees: float = 24.0
     enough_registered: float = 0.9  # share of the views that ends the search for a model
     # median error of points, pixels of the images, beyond which a model is in doubt:
-    # wrong focal lengths of a flight straight ahead have 0.62 to 0.67, a likely one 0.41
-    # (the first models of six other clips have 0.47 at most in the mean)
+    # wrong focal lengths of a flight straight ahead have 0.62 to 0.67, a likely one
+    # 0.41 (the first models of six other clips have 0.47 at most in the mean)
     max_good_error_px: float = 0.55
     max_attempts: int = 8  # mappings before the search ends
     min_registered: float = MIN_REGISTERED_SHARE  # share of the views below which poses have failed
