@@ -175,3 +175,19 @@ def edit(path: Path, change: Callable[[dict], object]) -> None:
     data = json.loads(path.read_text())
     change(data)
     path.write_text(json.dumps(data))
+
+
+def prepared(capsys: Capture, clip: Path, *options: object) -> str:
+    """The sentence with which `prepare` refuses to write `scene` next to the footage.
+
+    No other file may change.
+    """
+
+    def rest() -> dict[Path, bytes]:
+        files = snapshot(clip.parent)
+        return {p: b for p, b in files.items() if not p.is_relative_to(clip.parent / "scene")}
+
+    before = rest()
+    sentence = refused(capsys, "prepare", clip, clip.parent / "scene", *options)
+    assert rest() == before
+    return sentence

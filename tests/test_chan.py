@@ -75,9 +75,9 @@ def test_two_tracks_of_one_camera_have_one_line_for_every_picture(tmp_path: Path
     assert (tmp_path / "both.chan").read_text() == (tmp_path / "one.chan").read_text()
 
 
-@pytest.mark.parametrize(("num_pictures", "told"), [(2, True), (6, False)])
+@pytest.mark.parametrize(("num_pictures", "is_named"), [(2, True), (6, False)])
 def test_pictures_that_were_thinned_out_are_named_with_the_command_for_all(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], num_pictures: int, told: bool
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], num_pictures: int, is_named: bool
 ) -> None:
     run = replace(fake_run(tmp_path), folder=tmp_path / "run")
     assert len(plan_shot(run, "training").views) == 6
@@ -88,4 +88,4 @@ def test_pictures_that_were_thinned_out_are_named_with_the_command_for_all(
     export_chan(run, tmp_path / "camera.chan")
     command = f"`hdr-nsff render {run.folder} --path training --out {shot.parent}`"
     sentence = f"has 2 of these pictures, numbered otherwise; {command} renders them all"
-    assert (sentence in capsys.readouterr().err) is told
+    assert (sentence in capsys.readouterr().err) is is_named

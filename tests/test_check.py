@@ -364,7 +364,11 @@ def rig_of(folder: Path, evs: dict[str, float], count: int = 6) -> Path:
     """Cameras beside each other before the toy scene, each with its exposure."""
     scene = ToyScene(WIDTH, HEIGHT)
     for k, (name, ev) in enumerate(evs.items()):
-        clip_of(folder / name, lambda t, k=k: scene.see(t + 0.2 * k)[0], [ev] * count)  # type: ignore[misc]
+
+        def see(t: float, place: int = k) -> np.ndarray:
+            return scene.see(t + 0.2 * place)[0]
+
+        clip_of(folder / name, see, [ev] * count)
     return folder
 
 

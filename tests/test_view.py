@@ -55,8 +55,8 @@ def test_a_run_that_never_began_is_not_offered(
 ) -> None:
     monkeypatch.setattr(module.subprocess, "Popen", FakeProcess)
     assert call(*training(tmp_path / "none", tmp_path / "run", 1), "--view") == 2
-    told = capsys.readouterr().err
-    assert "the viewer has closed" in told and "opens it again" not in told
+    lines = capsys.readouterr().err
+    assert "the viewer has closed" in lines and "opens it again" not in lines
 
 
 def test_other_verbs_have_no_such_option(tmp_path: Path) -> None:

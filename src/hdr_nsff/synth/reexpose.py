@@ -161,9 +161,7 @@ def reexpose(config: ReexposeConfig) -> Path:
         fps = footage.fps / config.stride
         check_references(config.clip, (size[1], size[0]), fps, reference_kinds(config))
         plan = plan_frames(len(numbers), len(evs), config.hold_out, config.poses is not None)
-        poses = None
-        if config.poses is not None:
-            poses = read_poses(config.poses, footage, numbers, size)
+        poses = None if config.poses is None else read_poses(config.poses, footage, numbers, size)
         color = exposure.all_clipped(extents)
         if color is not None:
             raise InputError(
@@ -187,7 +185,7 @@ def reexpose(config: ReexposeConfig) -> Path:
         f"{len(plan.kept)} frames in {config.out / 'clip'}, "
         f"{len(plan.test)} true views in {config.out / 'truth'}"
     )
-    say_rate(footage.fps / config.stride)
+    say_rate(fps)
     say(f"next: hdr-nsff prepare {config.out / 'clip'} SCENE --ev={config.ev} {given}")
     return config.out
 

@@ -247,8 +247,8 @@ class Mapper:
 
     def bent_poses(self, mapping: Mapping, max_error_px: float = np.inf) -> Poses:
         """Poses of a reconstruction with a lens, which starts from the earlier one's if
-        there is one, and the lenses unless they bend too little after all, or points
-        miss by more than `max_error_px` in the median, pixels of the images.
+        there is one. Its lenses count unless they bend too little after all, or points
+        miss by more than `max_error_px` (median, pixels of the images).
         """
         start = {name: c for name, c in self.earlier.model.items() if name != LENS_FILE}
         round_of_its_own = EarlierRounds(self.earlier.matches, start)
@@ -258,11 +258,9 @@ class Mapper:
         lenses = self.lenses(model, lambda camera: lens_of(model, camera, fit, tuning))
         poses = self.of_model(model, scale)
         largest = max(lens.max_displacement_px() for lens in lenses.values())
-        if mapping.refine and largest < self.tuning.lens.min_displacement_px:
-            return poses
-        if median_error(model, self.tuning) > max_error_px:
-            return poses
-        return replace(poses, lenses=lenses)
+        bends = largest >= tuning.min_displacement_px or not mapping.refine
+        fits = median_error(model, self.tuning) <= max_error_px
+        return replace(poses, lenses=lenses) if bends and fits else poses
 
     def lenses(self, model: ColmapModel, of_camera: Callable[[int], Lens]) -> dict[int, Lens]:
         """The lens of each group of views, of the size of the frames."""
