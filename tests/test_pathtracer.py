@@ -81,6 +81,18 @@ def test_a_tiny_picture_holds_the_range_it_promises(tracer: Tracer) -> None:
     assert np.abs(pictures[0] - pictures[1]).max() > 0.1  # the room moves
 
 
+def test_rows_are_traced_alone_as_within_the_picture(tracer: Tracer) -> None:
+    size, pose = (32, 36), camera_pose(0)
+    arguments = (0, intrinsics(*size), pose, size, 64)
+    whole = [tracer.radiance(*arguments, seed)[20:24] for seed in (0, 1)]
+    rows = tracer.radiance(*arguments, 2, (20, 24))
+    assert rows.shape == (4, 32, 3)
+    noise = np.abs(whole[0] - whole[1]).mean()
+    assert np.abs(rows - whole[0]).mean() < 1.5 * noise
+    alone = tracer.surface(*arguments[:-1], (20, 24))
+    np.testing.assert_array_equal(alone.depth, tracer.surface(*arguments[:-1]).depth[20:24])
+
+
 def test_a_ray_that_leaves_the_scene_sees_a_static_sky_of_depth_0() -> None:
     """A tall picture looks over the walls of the courtyard."""
     pytest.importorskip("mitsuba", reason="mitsuba is not installed: pip install 'hdr-nsff[synth]'")

@@ -225,3 +225,25 @@ def test_a_point_behind_a_camera_does_not_hide_the_error_of_the_others(tmp_path)
     drop_lost_points(found)
     assert len(found.points3D) == count - 1
     assert mean_error(found) == pytest.approx(error, rel=0.01)
+
+
+def adjusted_focal(folder, job, start, focal):
+    """The focal length after an `adjust` of the model in `start`, begun with `focal`."""
+    pycolmap = pytest.importorskip("pycolmap")
+    known = pycolmap.Reconstruction(start)
+    known.cameras[1].focal_length = focal
+    (folder / "known").mkdir(exist_ok=True)
+    known.write_binary(folder / "known")
+    ((model,),) = models_of([replace(job, task="adjust", start=str(folder / "known"))], 1)
+    return model.cameras[1].K[0, 0]
+
+
+def test_a_known_focal_length_stays_unless_another_fits_clearly_better(tmp_path):
+    pytest.importorskip("pycolmap")
+    names, named = write_seen_points(tmp_path, 300.0, 320)
+    job = sfm.Job(str(tmp_path), [names], named, 277.0, "incremental")
+    ((start,),) = sfm.run_in_turn([job], 1)
+    assert adjusted_focal(tmp_path, job, start, 303.0) == pytest.approx(303, abs=0.01)
+    assert adjusted_focal(tmp_path, job, start, 390.0) == pytest.approx(300, rel=0.03)
+    eager = replace(job, tuning=sfm.SfmTuning(max_free_known_focal_error_share=0.9999))
+    assert adjusted_focal(tmp_path, eager, start, 303.0) == pytest.approx(300, rel=0.005)

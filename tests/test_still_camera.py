@@ -118,6 +118,14 @@ def test_a_wall_above_somebody_who_fills_the_picture_is_a_background():
     assert still_camera_shifts(clip, tuning=spread_out) is None
 
 
+@pytest.mark.parametrize("hidden, still", [(0.2, True), (0.5, False)])
+def test_a_wall_that_is_hidden_for_a_while_is_a_background(hidden: float, still: bool):
+    clip = shaken_below(H // 3, above=True)
+    covered = np.s_[: round(hidden * NUM), : H // 3]
+    clip[covered] = noisy(panning(np.linspace(-30, 30, NUM)))[covered]
+    assert (still_camera_shifts(clip) is not None) == still
+
+
 def before_a_plain_wall(shake: float = 0.0, passing: bool = False) -> np.ndarray:
     """A clip (NUM, H, W, 3): something large moves in the middle, before a wall with a
     few spots. The camera is shaken by `shake` pixels; something may be `passing` on the

@@ -14,10 +14,10 @@ VIEW = TracedView("clip_00003", 3.0, np.eye(3, 4), 64, 5, anchor=3)
 SCENE = SimpleNamespace(pose=lambda views, t: np.full((3, 4), t))
 
 
-def clock(time, K, pose, size, spp, seed):
-    """A picture of the squared time, by a camera that is where it should be."""
+def clock(time, K, pose, size, spp, seed, rows):
+    """Rows of the squared time, by a camera that is where it should be."""
     assert (pose == time).all()
-    return np.full((size[1], size[0], 3), time**2, np.float32)
+    return np.full((rows[1] - rows[0], size[0], 3), time**2, np.float32)
 
 
 def seen(exposure: Exposure) -> np.ndarray:
@@ -39,8 +39,9 @@ def test_a_camera_of_a_rig_stays_in_its_place_while_its_rows_are_read() -> None:
     """Over more than a frame's time, where other cameras of the rig record."""
     view = clip_views(INTERIOR, 12, 64, 0, "rig")[3]
 
-    def distance(time, K, pose, size, spp, seed):
-        return np.full((size[1], size[0], 3), np.abs(pose - view.c2w).max(), np.float32)
+    def distance(time, K, pose, size, spp, seed, rows):
+        away = np.abs(pose - view.c2w).max()
+        return np.full((rows[1] - rows[0], size[0], 3), away, np.float32)
 
     tracer = SimpleNamespace(radiance=distance)
     exposure = Exposure(1.44, 0.5)

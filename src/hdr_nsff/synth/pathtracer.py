@@ -210,8 +210,12 @@ class Tracer:
         values.update()
         return scene
 
-    def sensor(self, K: np.ndarray, c2w: np.ndarray, size: tuple[int, int]) -> Any:
-        """Mitsuba's camera; a pixel is averaged over its own square."""
+    def sensor(
+        self, K: np.ndarray, c2w: np.ndarray, size: tuple[int, int], rows: tuple[int, int]
+    ) -> Any:
+        """Mitsuba's camera that sees the `rows`; a pixel is averaged over its own
+        square.
+        """
         width, height = size
         field_of_view = 2 * np.arctan(width / 2 / K[0, 0])
         pose = np.vstack([c2w, [0, 0, 0, 1]]) @ OPENCV_TO_MITSUBA
@@ -219,6 +223,9 @@ class Tracer:
             "type": "hdrfilm",
             "width": width,
             "height": height,
+            "crop_offset_y": rows[0],
+            "crop_width": width,
+            "crop_height": rows[1] - rows[0],
             "rfilter": {"type": "box"},
             "pixel_format": "rgb",
         }
@@ -235,12 +242,22 @@ class Tracer:
         return self.mi.load_dict(camera)
 
     def radiance(
-        self, t: float, K: np.ndarray, c2w: np.ndarray, size: tuple[int, int], spp: int, seed: int
+        self,
+        t: float,
+        K: np.ndarray,
+        c2w: np.ndarray,
+        size: tuple[int, int],
+        spp: int,
+        seed: int,
+        rows: tuple[int, int] | None = None,
     ) -> np.ndarray:
         """Linear radiance (H, W, 3) >= 0 at time `t`, from `spp` samples per pixel and
-        lamp for direct light and as many paths.
+        lamp for direct light and as many paths; of `rows` alone, from the first to
+        before the last, (rows, W, 3).
         """
-        sensor = self.sensor(K, c2w, size)
+        first, last = (0, size[1]) if rows is None else rows
+        seen = max(0, first - BLUR_RADIUS_PX), min(size[1], last + BLUR_RADIUS_PX)
+        sensor = self.sensor(K, c2w, size, seen)
         scene = self.scene_at(self.scene, t)
         straight = {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0}
         full = {"type": "path", "max_depth": MAX_DEPTH, "rr_depth": ROULETTE_DEPTH}
@@ -250,9 +267,10 @@ class Tracer:
         )
         paths = self.average(scene, sensor, full, spp, seed)[..., :3]
         albedo = np.maximum(self.average(scene, sensor, guide, spp, seed)[..., -3:], MIN_ALBEDO)
-        surface = self.surface(t, K, c2w, size)
+        surface = self.surface(t, K, c2w, size, seen)
         bounced = albedo * smooth((paths - direct) / albedo, surface, self.content.blur)
-        return (direct + np.maximum(bounced, 0)).astype(np.float32)
+        picture = (direct + np.maximum(bounced, 0)).astype(np.float32)
+        return picture[first - seen[0] : last - seen[0]]
 
     def average(
         self, scene: Any, sensor: Any, integrator: dict[str, Any], spp: int, seed: int
@@ -269,11 +287,20 @@ class Tracer:
             images.append(np.array(image, np.float64))
         return np.sum(images, 0) / passes
 
-    def surface(self, t: float, K: np.ndarray, c2w: np.ndarray, size: tuple[int, int]) -> Surface:
-        """The first surface along the ray through every pixel center."""
+    def surface(
+        self,
+        t: float,
+        K: np.ndarray,
+        c2w: np.ndarray,
+        size: tuple[int, int],
+        rows: tuple[int, int] | None = None,
+    ) -> Surface:
+        """The first surface along the ray through every pixel center, in `rows`."""
         width, height = size
+        first, last = (0, height) if rows is None else rows
         origin = c2w[:, 3]
-        pixels = pinhole.pixel_centers(height, width).reshape(-1, 2)
+        pixels = pinhole.pixel_centers(height, width)[first:last].reshape(-1, 2)
+        height = last - first
         directions = pinhole.world_rays(pixels, K, c2w)
         depth, normals, uv, names = self.trace(self.scene_at(self.scene, t), origin, directions)
         sky = ~np.isfinite(depth)

@@ -55,12 +55,12 @@ def trace_exposure(
     spp = max(1, round(view.spp / moments))
     picture = np.zeros((height, size[0], 3), np.float32)
     for band in range(bands):
-        rows = slice(round(band * height / bands), round((band + 1) * height / bands))
+        rows = round(band * height / bands), round((band + 1) * height / bands)
         row_time = exposure.readout * ((band + 0.5) / bands - 0.5)
         for moment in range(moments):
             time = view.time + row_time + exposure.open * ((moment + 0.5) / moments - 0.5)
             pose = view.c2w if views == "rig" else scene.pose(views, time)
             seed = view.seed + moment * 100_003
-            traced = tracer.radiance(time, K, pose, size, spp, seed)
-            picture[rows] += traced[rows] / moments
+            traced = tracer.radiance(time, K, pose, size, spp, seed, rows)
+            picture[slice(*rows)] += traced / moments
     return picture

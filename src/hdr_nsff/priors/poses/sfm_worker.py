@@ -224,7 +224,10 @@ def adjust(model: Any, job: Job, final: bool) -> None:
     before = {key: list(camera.params) for key, camera in model.cameras.items()}
     held_error = mean_error(model)
     pycolmap.bundle_adjustment(model, free)
-    if mean_error(model) > tuning.max_free_focal_error_share * held_error:
+    max_share = tuning.max_free_focal_error_share
+    if job.task == "adjust":
+        max_share = tuning.max_free_known_focal_error_share
+    if mean_error(model) > max_share * held_error:
         for key, params in before.items():
             model.cameras[key].params = params
         pycolmap.bundle_adjustment(model, held)
