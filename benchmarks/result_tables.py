@@ -269,14 +269,36 @@ def bench_scores_of_one(document: Document) -> Lines:
     return table(["method", "PSNR", "SSIM", "HDR", "depth error"], rows)
 
 
+GROWS_WITH = {
+    "frames": "frames, pixels",
+    "exposure": "frames; pictures are shrunk",
+    "flow": "frames (a few pairs each), pixels",
+    "poses": "frames; keypoints of the pixels; with parallax, and once more where masks change",
+    "masks": "frames, pixels of a grid of bounded size; rounds of poses",
+    "static_depth": "frames, pixels, planes; nothing without parallax",
+    "response": "frames, pixels of what is well seen",
+    "refined_flow": "pairs, moving pixels",
+    "movers": "tracks, which start in every frame where something moves",
+    "depth": "frames, pixels",
+    "sheet": "-",
+}
+
+
 def prepare_cost(document: Document) -> Lines:
-    """One line per scene: processor seconds of the steps that cost most."""
-    steps = ("all", "flow", "poses", "static_depth", "refined_flow", "movers")
-    scenes = list(dict.fromkeys(row["scene"] for row in document["results"]))
+    """One line per step: processor seconds per megapixel and frame of every clip, and
+    what they grow with; and of all steps.
+    """
+    found = {(row["scene"], row["step"]): row for row in document["results"]}
+    scenes = list(dict.fromkeys(scene for scene, _ in found))
     rows = []
-    for scene in scenes:
-        found = {row["step"]: row for row in document["results"] if row["scene"] == scene}
-        size = f"{found['all']['frames']} of {found['all']['pixels']:,} pixels"
-        seconds = [number(found[step]["cpu_seconds"], 0) for step in steps]
-        rows.append([f"`{scene}`", size, *seconds, number(found["all"]["peak_memory_gb"], 2)])
-    return table(["clip", "frames", *steps, "peak GB"], rows)
+    for step, growth in GROWS_WITH.items():
+        costs = [found[scene, step]["cpu_seconds_per_megapixel"] for scene in scenes]
+        rows.append([f"`{step}`", *(number(cost, 2) for cost in costs), growth])
+    every = [found[scene, "all"] for scene in scenes]
+    costs = [number(row["cpu_seconds_per_megapixel"], 2) for row in every]
+    rows.append(["all", *costs, "frames, pixels"])
+    minutes = [number(row["cpu_seconds"] / 60, 1) for row in every]
+    rows.append(["all, minutes", *minutes, ""])
+    rows.append(["peak GB", *(number(row["peak_memory_gb"], 2) for row in every), "pixels"])
+    sizes = [f"`{row['scene']}`, {row['frames']} of {row['pixels']:,}" for row in every]
+    return table(["step", *sizes, "grows with"], rows)

@@ -15,7 +15,7 @@ from test_video import write_interlaced
 
 from hdr_nsff.check.file import describe_file
 from hdr_nsff.core.hdr_video import write_hdr_video
-from hdr_nsff.core.video import read_video, write_video
+from hdr_nsff.core.video import frame_times, read_video, write_video
 from hdr_nsff.footage.footage import open_footage
 from hdr_nsff.footage.gpmf import read_gopro
 from hdr_nsff.footage.ingest import read_frames
@@ -114,6 +114,8 @@ def test_frames_that_an_edit_list_hides_are_not_read(tmp_path: Path) -> None:
     assert b"elst" in (tmp_path / "a.mp4").read_bytes()
     gray = [float(frame[16, 24, 1]) for frame, _ in read_video(tmp_path / "a.mp4")]
     assert len(gray) == 6 and gray[0] == pytest.approx(40 / 255, abs=0.02)
+    assert describe_file(open_footage(tmp_path / "a.mp4")).frames == 6
+    assert 25 * frame_times(tmp_path / "a.mp4") == pytest.approx(np.arange(6))
 
 
 def test_rows_of_two_moments_are_known(tmp_path: Path) -> None:

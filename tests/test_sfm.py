@@ -228,7 +228,7 @@ def test_a_point_behind_a_camera_does_not_hide_the_error_of_the_others(tmp_path)
 
 
 def adjusted_focal(folder, job, start, focal):
-    """The focal length after an `adjust` of the model in `start`, begun with `focal`."""
+    """The focal length after an `adjust` of the model in `start` from `focal`."""
     pycolmap = pytest.importorskip("pycolmap")
     known = pycolmap.Reconstruction(start)
     known.cameras[1].focal_length = focal

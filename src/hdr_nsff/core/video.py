@@ -176,8 +176,9 @@ def video_info(path: Path | str) -> VideoInfo:
             seconds = duration_of(container, stream)
             pixels = codec.format
             in_fragments = len(stream.index_entries) > stream.frames
+            hidden = sum(entry.is_discard for entry in stream.index_entries)  # by an edit list
             return VideoInfo(
-                0 if in_fragments else stream.frames,
+                0 if in_fragments else stream.frames - hidden,
                 float(stream.average_rate or DEFAULT_FPS),
                 seconds,
                 codec.color_trc,
@@ -226,9 +227,7 @@ def unreadable(path: Path, error: Exception) -> InputError:
 
 def frame_times(path: Path | str) -> np.ndarray:
     """Seconds (T,) at which the frames of a video are shown, in order; nothing is
-    decoded.
-
-    Frames that an edit list hides count too. InputError where the file is no video.
+    decoded. InputError where the file is no video.
     """
     return frame_spans(path)[:, 0]
 
@@ -245,7 +244,7 @@ def frame_spans(path: Path | str) -> np.ndarray:
             found = [
                 (float(p.pts * p.time_base), float((p.duration or 0) * p.time_base))
                 for p in container.demux(video=0)
-                if p.pts is not None
+                if p.pts is not None and not p.is_discard
             ]
     except (av.FFmpegError, OSError, UnicodeDecodeError) as error:
         raise unreadable(path, error) from error
