@@ -225,7 +225,7 @@ def adjust(model: Any, job: Job, final: bool) -> None:
     held_error = mean_error(model)
     pycolmap.bundle_adjustment(model, free)
     max_share = tuning.max_free_focal_error_share
-    if job.task == "adjust":
+    if job.task == "adjust" and not job.distortion:
         max_share = tuning.max_free_known_focal_error_share
     if mean_error(model) > max_share * held_error:
         for key, params in before.items():
