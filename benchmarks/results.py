@@ -91,12 +91,14 @@ SECTIONS = (
     Section(
         "bench-lenses",
         "Lenses and shutters",
-        "Rendered scenes of 160x90 pixels, recorded through a lens that darkens the corners by "
-        "the cos^4 law, with a rolling shutter of 25 ms, with a shutter open for half of a "
-        "frame's time, and through a lens with k1 of -0.15; from frames alone. PSNR after 1,000 "
-        "steps without and with the model of it, of recordings that need it and of plain ones; "
-        "held-out views have none of it. At last the training time with the model over that "
-        "without, where it has nothing to explain.",
+        "Rendered scenes of 160x90 pixels from frames alone, recorded through a lens that "
+        "darkens the corners by the cos^4 law, with a rolling shutter of 25 ms, with a shutter "
+        "that is open for half of a frame's time at the brightest exposure, and through a lens "
+        "with k1 of -0.15. Held-out views have none of it. PSNR after 1,000 steps, without and "
+        "with the model of it: of these recordings, and of plain ones. Vignetting and lenses are "
+        "looked for in every clip; `--readout` and `--shutter` are models only where they are "
+        "given, here wrongly to plain recordings. At last the training time with the model over "
+        "that without, where there is nothing to explain.",
         "hdr-nsff synth SCENE SCENE-rolling --size 160x90 --spp 64 --truth-spp 64 --readout 25 && "
         'hdr-nsff bench OUT --scenes ... --methods "splat,no-vignetting=splat --set '
         'tonemap.vignetting=false,readout=splat --readout 25,shutter=splat --shutter 0.5" '
