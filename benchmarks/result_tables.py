@@ -300,5 +300,5 @@ def prepare_cost(document: Document) -> Lines:
     minutes = [number(row["cpu_seconds"] / 60, 1) for row in every]
     rows.append(["all, minutes", *minutes, ""])
     rows.append(["peak GB", *(number(row["peak_memory_gb"], 2) for row in every), "pixels"])
-    sizes = [f"`{row['scene']}`, {row['frames']} of {row['pixels']:,}" for row in every]
+    sizes = [f"`{row['scene']}` ({row['frames']} x {row['pixels']:,})" for row in every]
     return table(["step", *sizes, "grows with"], rows)
