@@ -98,7 +98,10 @@ SECTIONS = (
         "with the model of it: of these recordings, and of plain ones. Vignetting and lenses are "
         "looked for in every clip; `--readout` and `--shutter` are models only where they are "
         "given, here wrongly to plain recordings. At last the training time with the model over "
-        "that without, where there is nothing to explain.",
+        "that without, where there is nothing to explain; other programs ran meanwhile. What "
+        "`--readout` and `--shutter` cannot mend is lost before training: a rolling shutter bends "
+        "poses (rotations off by 0.29 degrees instead of 0.04 in `interior`, 0.45 instead of 0.16 "
+        "in `lamp`), blur spoils flow (1.3 pixels off instead of 0.9 in `lamp`).",
         "hdr-nsff synth SCENE SCENE-rolling --size 160x90 --spp 64 --truth-spp 64 --readout 25 && "
         'hdr-nsff bench OUT --scenes ... --methods "splat,no-vignetting=splat --set '
         'tonemap.vignetting=false,readout=splat --readout 25,shutter=splat --shutter 0.5" '
