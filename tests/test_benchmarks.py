@@ -15,7 +15,7 @@ from hdr_nsff.scene.scene import Scene
 from hdr_nsff.training.presets import PRESETS
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
-HELPERS = ("markdown_tables", "record", "results", "step_errors")
+HELPERS = ("markdown_tables", "record", "result_tables", "results", "step_errors")
 NAMES = sorted(path.stem for path in FOLDER.glob("*.py") if path.stem not in HELPERS)
 
 
