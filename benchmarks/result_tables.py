@@ -110,8 +110,9 @@ def bench_clips(document: Document) -> Lines:
     return [*table(["clip", steps, "SSIM", *heads], rows), "", f"{budget}: {origin(fields)}"]
 
 
-LENS_MODELS = {  # of what recordings have: without a model of it, and with, as bench names
-    # them: what follows the scene's name, and the method
+# Of every effect: the run without its model and the run with it, each as the end of
+# its scene's name and its method.
+LENS_MODELS = {
     "vignetted": (("", "no-vignetting"), ("", "splat")),
     "rolling": (("", "splat"), ("", "readout")),
     "blurred": (("", "splat"), ("", "shutter")),
@@ -120,8 +121,8 @@ LENS_MODELS = {  # of what recordings have: without a model of it, and with, as 
 
 
 def bench_lenses(document: Document) -> Lines:
-    """One line per model of a lens or shutter: PSNR without it and with it, on
-    recordings that need it and on those that do not, and how much longer a step takes.
+    """One line per effect of a lens or shutter: PSNR without its model and with it, on
+    clips with the effect and without, and the ratio of training times on the latter.
     """
     found = {(run["scene"], run["method"]): run["values"] for run in document["results"]}
     scenes = [scene.removesuffix("-plain") for scene, _ in found if scene.endswith("-plain")]
@@ -136,8 +137,8 @@ def bench_lenses(document: Document) -> Lines:
                 if recorded == "plain":
                     ratios.append(ends[1]["train_seconds"] / ends[0]["train_seconds"])
         rows.append([*row, number(statistics.fmean(ratios), 2)])
-    heads = [f"`{scene}`{end}" for scene in scenes for end in (", recorded so", ", without")]
-    return table(["recorded", *heads, "time, without"], rows)
+    heads = [f"`{scene}`{end}" for scene in scenes for end in (" with it", " without it")]
+    return table(["effect", *heads, "training time"], rows)
 
 
 def bench_rig(document: Document) -> Lines:
@@ -269,6 +270,7 @@ def bench_scores_of_one(document: Document) -> Lines:
     return table(["method", "PSNR", "SSIM", "HDR", "depth error"], rows)
 
 
+# What the cost of every step of `prepare` grows with.
 GROWS_WITH = {
     "frames": "frames, pixels",
     "exposure": "frames; pictures are shrunk",

@@ -210,8 +210,8 @@ def from_known_poses(job: Job, database: Path) -> Any:
 
 def adjust(model: Any, job: Job, final: bool) -> None:
     """Adjust cameras and points to each other, and focal lengths where that lowers the
-    error: a camera that slides without turning does not determine them. Only the
-    `final` adjustment runs to convergence.
+    error, clearly if an earlier round found them: a camera that slides without turning
+    does not determine them. Only the `final` adjustment runs to convergence.
     """
     pycolmap = load_pycolmap()
     tuning = job.tuning

@@ -193,12 +193,7 @@ def shifts_if_spread(found: Detail, tuning: StillCameraTuning) -> np.ndarray | N
     shifts = found.shifts(found.kept)
     if (shifts < tuning.max_shift_px).mean() < tuning.still_share:
         return None
-    still = [
-        part.mean()
-        for part in quarters(found.kept)
-        if np.median(found.shifts(part)) <= tuning.max_quarter_shift_px
-    ]
-    return shifts if sum(still) >= (1 - tuning.max_moving_share) * found.kept.mean() else None
+    return shifts if holds_in_quarters(found, tuning) else None
 
 
 def shifts_if_above(found: Detail, tuning: StillCameraTuning) -> np.ndarray | None:
@@ -214,8 +209,9 @@ def shifts_if_above(found: Detail, tuning: StillCameraTuning) -> np.ndarray | No
     if shown.mean() < tuning.min_presence:
         return None
     shifts = found.shifts(found.kept)
-    small = shifts[shown] < tuning.max_shift_above_px
-    return shifts if small.mean() >= tuning.still_share else None
+    if (shifts[shown] < tuning.max_shift_above_px).mean() < tuning.still_share:
+        return None
+    return shifts if holds_in_quarters(found, tuning) else None
 
 
 def shifts_if_calm(found: Detail, tuning: StillCameraTuning) -> np.ndarray | None:
@@ -290,6 +286,16 @@ def has_calm_edges(found: Detail, tuning: StillCameraTuning) -> bool:
     edges = sides(share.shape, tuning.edge_share)
     left, right = np.split(np.where(edges, share, np.nan), [share.shape[1] // 2], axis=1)
     return bool(max(np.nanmean(left), np.nanmean(right)) < tuning.max_change_calm)
+
+
+def holds_in_quarters(found: Detail, tuning: StillCameraTuning) -> bool:
+    """Whether nearly all kept detail is in quarters of the picture that do not move."""
+    still = [
+        part.mean()
+        for part in quarters(found.kept)
+        if np.median(found.shifts(part)) <= tuning.max_quarter_shift_px
+    ]
+    return bool(sum(still) >= (1 - tuning.max_moving_share) * found.kept.mean())
 
 
 def is_spread(kept: np.ndarray, tuning: StillCameraTuning) -> bool:
