@@ -92,9 +92,9 @@ SECTIONS = (
         "bench-lenses",
         "Lenses and shutters",
         "Rendered scenes of 160x90 pixels, trained from frames alone for 1,000 steps, each "
-        "recorded with one effect and without any: corners darkened by the cos^4 law, a rolling shutter of "
-        "25 ms, a shutter open for half of a frame's time at the brightest exposure, a lens with "
-        "k1 of -0.15. Held-out views have none of them. Each cell is the PSNR without the model "
+        "recorded with one effect and without any: corners darkened by the cos^4 law, a rolling "
+        "shutter of 25 ms, a shutter open for half of a frame's time at the brightest exposure, a lens "
+        "with k1 of -0.15. Held-out views have none of them. Each cell is the PSNR without the model "
         "of the effect, then with it. Vignetting and lens distortion are estimated from every "
         "clip. `--readout` and `--shutter` apply only where they are given; the columns without "
         "the effect show what giving them by mistake costs. The last column is the ratio of "
