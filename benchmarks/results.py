@@ -93,16 +93,16 @@ SECTIONS = (
         "Lenses and shutters",
         "Rendered scenes of 160x90 pixels, trained from frames alone for 1,000 steps, each "
         "recorded with one effect and without any: corners darkened by the cos^4 law, a rolling "
-        "shutter of 25 ms, a shutter open for half of a frame's time at the brightest exposure, a lens "
-        "with k1 of -0.15. Held-out views have none of them. Each cell is the PSNR without the model "
-        "of the effect, then with it. Vignetting and lens distortion are estimated from every "
-        "clip. `--readout` and `--shutter` apply only where they are given; the columns without "
-        "the effect show what giving them by mistake costs. The last column is the ratio of "
-        "training times with and without the model, on clips without the effect, while other "
-        "programs were running. Neither option corrects what was estimated from the footage: the "
-        "rolling shutter biases the poses (rotation errors of 0.29 degrees instead of 0.04 in "
-        "`interior`, 0.45 instead of 0.16 in `lamp`), and motion blur the flow (end-point error "
-        "of 1.3 pixels instead of 0.9 in `lamp`).",
+        "shutter of 25 ms, a shutter open for half of a frame's time at the brightest exposure, "
+        "a lens with k1 of -0.15. Held-out views have none of them. Each cell is the PSNR "
+        "without the model of the effect, then with it. Vignetting and lens distortion are "
+        "estimated from every clip. `--readout` and `--shutter` apply only where they are given; "
+        "the columns without the effect show what giving them by mistake costs. The last column "
+        "is the ratio of training times with and without the model, on clips without the effect, "
+        "while other programs were running. Neither option corrects what was estimated from the "
+        "footage: the rolling shutter biases the poses (rotation errors of 0.29 degrees instead "
+        "of 0.04 in `interior`, 0.45 instead of 0.16 in `lamp`), and motion blur the flow "
+        "(end-point error of 1.3 pixels instead of 0.9 in `lamp`).",
         "hdr-nsff synth SCENE SCENE-rolling --size 160x90 --spp 64 --truth-spp 64 --readout 25 && "
         'hdr-nsff bench OUT --scenes ... --methods "splat,no-vignetting=splat --set '
         'tonemap.vignetting=false,readout=splat --readout 25,shutter=splat --shutter 0.5" '
