@@ -187,6 +187,12 @@ def test_the_picture_and_the_controls_fit_the_window(
 # Over time
 
 
+def test_a_layout_draws_anew_where_the_size_is_another(viewer: Page) -> None:
+    layout = "(viewer.dirty = false, viewer.fit({}), viewer.dirty)"
+    assert not viewer.run(layout.format("...viewer.room"))
+    assert viewer.run(layout.format("viewer.room[0] / 2, viewer.room[1]"))
+
+
 def test_a_new_state_of_the_scene_is_sorted_again(viewer: Page) -> None:
     viewer.run("viewer.set({playing: true})")
     started = "const old = viewer.renderer, done = viewer.replace(viewer.scene);"

@@ -177,8 +177,8 @@ export class Player {
     const pixels = sizeAt(ratio);
     if (canvas.width !== pixels[0] || canvas.height !== pixels[1]) {
       [canvas.width, canvas.height] = pixels;
+      this.touch();
     }
-    this.touch();
     return shown;
   }
 
