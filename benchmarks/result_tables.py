@@ -114,7 +114,7 @@ def bench_clips(document: Document) -> Lines:
 # its scene's name and its method.
 LENS_MODELS = {
     "vignetted": (("", "no-vignetting"), ("", "splat")),
-    "rolling": (("", "splat"), ("", "readout")),
+    "rolling": (("", "splat"), ("-readout", "splat")),
     "blurred": (("", "splat"), ("", "shutter")),
     "bent": (("-pinhole", "splat"), ("", "splat")),
 }

@@ -12,8 +12,9 @@ from test_splat import BESIDE, CAMERA, STEP, batch_of, card_field
 from torch import Tensor
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.fields.build import timing_of
+from hdr_nsff.fields.build import scene_shutter, timing_of
 from hdr_nsff.fields.splat import training_view
+from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.shutter import (
     MAX_RENDERS,
     Shutter,
@@ -92,7 +93,7 @@ def test_as_many_renders_as_pixels_of_blur() -> None:
 def timing(exposures: list[float], seconds: float | None = None, **known: Any) -> Timing:
     """Of frames at these exposures in stops, the longest exposed for `seconds`."""
     times = [None if seconds is None else seconds * 2 ** (ev - max(exposures)) for ev in exposures]
-    numbers: dict[str, Any] = {"fps": 25.0, "stride": 1, "frame_seconds": None, **known}
+    numbers: dict[str, Any] = {"interval": 0.04, "stride": 1, "frame_seconds": None, **known}
     return Timing(exposure_times=tuple(times), exposures=tuple(exposures), **numbers)
 
 
@@ -116,15 +117,17 @@ def test_exposure_times_say_for_how_long_the_shutter_is_open() -> None:
 @pytest.mark.parametrize("share", [0.5, "auto"])
 def test_a_frame_of_every_second_one_is_twice_as_long(share: float | Literal["auto"]) -> None:
     every = timing([0.0], seconds=0.02, frame_seconds=0.04)
-    second = replace(every, stride=2, fps=12.5)
+    second = replace(every, stride=2, interval=0.08)
     one, two = shutter_for(10.0, share, every), shutter_for(10.0, share, second)
     assert one == Shutter(0.25, (0.5,)) and two == Shutter(0.125, (0.25,))
 
 
-def test_a_readout_counts_in_the_time_from_frame_to_frame() -> None:
-    """Of a folder by timestamps, whatever rate it plays at."""
-    found = shutter_for(10.0, 0.0, timing([0.0], fps=24.0, frame_seconds=0.1))
-    assert found is not None and found.readout == pytest.approx(0.1)
+def test_a_field_has_the_readout_of_its_scene_unless_told_another(toy: Scene) -> None:
+    rolling = replace(toy, manifest=toy.manifest.model_copy(update={"readout": 10.0}))
+    of_scene = scene_shutter(SplatConfig(), rolling)
+    assert of_scene == Shutter(pytest.approx(0.01 * toy.manifest.fps))
+    assert scene_shutter(SplatConfig(readout=0.0), rolling) is None
+    assert scene_shutter(SplatConfig(), toy) is None
 
 
 @pytest.mark.parametrize(
@@ -151,10 +154,12 @@ def test_a_shutter_that_the_scene_does_not_know_is_refused_before_a_run_begins(
 def test_a_scene_says_when_its_frames_were_taken(toy: Scene) -> None:
     frames = toy.manifest.frames
     entries = [f.model_copy(update={"exposure_time": 0.001 * (f.index + 1)}) for f in frames]
-    manifest = toy.manifest.model_copy(update={"frames": entries, "stride": 3})
+    update = {"frames": entries, "stride": 3, "frame_seconds": 0.1}
+    manifest = toy.manifest.model_copy(update=update)
     drifting = [replace(f, drift=0.5) for f in toy.train]
     found = timing_of(replace(toy, manifest=manifest, train=drifting))
-    assert found.stride == 3 and found.fps == toy.manifest.fps
+    assert found.stride == 3 and found.interval == pytest.approx(0.3)
+    assert timing_of(toy).interval == pytest.approx(1 / toy.manifest.fps)
     assert found.exposure_times == tuple(0.001 * (f.index + 1) for f in toy.train)
     ev = [float(toy.response.ev[f.bracket]) + 0.5 for f in toy.train]
     assert found.exposures == pytest.approx(tuple(ev))

@@ -60,8 +60,6 @@ class RunConfig(PrepareConfig):
     """
     minutes: float | None = None
     """Training time instead of the preset's; of each segment or part."""
-    readout: float = 0.0
-    """Milliseconds from a rolling shutter's first row to its last (`splat`)."""
     shutter: float | Literal["auto"] = 0.0
     """Motion blur (`splat`): share of the time from frame to frame of the clip for
     which the longest exposure takes light; auto: as the exposure times say, where a
@@ -181,7 +179,7 @@ def with_shutter(settings: TrainConfig, config: RunConfig) -> TrainConfig:
             f"--readout, --shutter: --preset {config.preset} takes every frame for a moment; "
             "choose --preset splat, or leave them out"
         )
-    shutter = replace(settings.field, readout=config.readout, shutter=config.shutter)
+    shutter = replace(settings.field, shutter=config.shutter)
     return replace(settings, field=shutter)
 
 

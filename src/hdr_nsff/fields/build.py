@@ -21,7 +21,7 @@ from hdr_nsff.fields.splat import cuda_backends
 from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.initialize_gaussians import initialize_gaussians
 from hdr_nsff.fields.splat.initialize_local import count_local_pixels, limit_rigid_movers
-from hdr_nsff.fields.splat.shutter import Timing, shutter_for
+from hdr_nsff.fields.splat.shutter import Shutter, Timing, shutter_for
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.scene.scene import Scene
 
@@ -51,7 +51,7 @@ def device_for(config: FieldConfig, name: str) -> torch.device:
 def check_scene(config: FieldConfig, scene: Scene) -> None:
     """InputError where a field needs to know more of a scene than this one says."""
     if isinstance(config, SplatConfig):
-        shutter_for(config.readout, config.shutter, timing_of(scene))
+        scene_shutter(config, scene)
 
 
 def build_field(config: FieldConfig, scene: Scene) -> AnyField:
@@ -61,7 +61,7 @@ def build_field(config: FieldConfig, scene: Scene) -> AnyField:
         local_pixels = count_local_pixels(limit_rigid_movers(scene, config.bases))
         if config.moving is None and not any(mover.rigid for mover in scene.movers):
             config = replace(config, moving=0)  # there is nothing for them to draw
-        shutter = shutter_for(config.readout, config.shutter, timing_of(scene))
+        shutter = scene_shutter(config, scene)
         num_pixels = m.width * m.height
         return Splat(config, scene.times, near, far, num_pixels, local_pixels, shutter)
     space = build_space([f.camera for f in scene.train], near, far)
@@ -85,12 +85,18 @@ def build_field(config: FieldConfig, scene: Scene) -> AnyField:
     return field
 
 
+def scene_shutter(config: SplatConfig, scene: Scene) -> Shutter | None:
+    """The shutter of a scene's clip; InputError as of `shutter_for`."""
+    readout = scene.manifest.readout if config.readout is None else config.readout
+    return shutter_for(readout, config.shutter, timing_of(scene))
+
+
 def timing_of(scene: Scene) -> Timing:
     """When the training frames of a scene were taken, and for how long."""
     m = scene.manifest
     seconds = {entry.index: entry.exposure_time for entry in m.frames}
     return Timing(
-        fps=m.fps,
+        interval=m.frame_interval,
         stride=m.stride,
         frame_seconds=m.frame_seconds,
         exposure_times=tuple(seconds.get(f.index) for f in scene.train),

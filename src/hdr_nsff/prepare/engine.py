@@ -116,7 +116,7 @@ def step_key(work: Work, name: StepName, step: Step) -> str:
     settings: dict[str, Any] = {}
     for setting in step.settings:
         value = getattr(work.config, setting)
-        if setting in ("same_camera", "tripod") and not value:
+        if setting in ("same_camera", "tripod", "readout") and not value:
             continue  # so that scenes made without it stay as they are
         if (name, setting) == ("poses", "masks") and isinstance(value, str) and not work.capture:
             value = None  # which network outlines the masks later does not affect poses

@@ -49,6 +49,8 @@ from hdr_nsff.prepare.work import Part, PrepareConfig, Work
 from hdr_nsff.priors.flow.sources import check_flow
 from hdr_nsff.scene.manifest import Manifest
 
+MAX_READOUT_MS = 1000
+
 __all__ = ["STEPS", "PrepareConfig", "prepare"]
 
 
@@ -220,6 +222,11 @@ def check_settings(config: PrepareConfig) -> None:
         )
     parse_exposures(config.exposures, config.ev)
     parse_lens(config.lens_distortion)
+    if not 0 <= config.readout <= MAX_READOUT_MS:
+        raise InputError(
+            f"--readout {config.readout:g}: give the milliseconds from a rolling shutter's first "
+            f"row to its last, 0 to {MAX_READOUT_MS}"
+        )
     if config.rig is not None and config.rig < 1:
         raise InputError(f"--rig {config.rig}: give the number of cameras, or 1 for one camera")
     if config.tripod and config.poses is not None:

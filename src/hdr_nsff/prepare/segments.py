@@ -251,7 +251,7 @@ def take_poses(clip: Work, work: Work) -> StepResult:
         if len(seen):  # without, points were given: all of them count
             points = points[np.unique(seen[np.isin(frames, work.segment.rows)])]
     files = {"points.npy": lambda path: write_npy(path, points)} if len(points) else {}
-    values = {name: getattr(m, name) for name in ("parallax", "near", "far")}
+    values = {name: getattr(m, name) for name in ("parallax", "near", "far", "readout")}
     return StepResult(
         note="",
         details={"registered": [registered[f.index] for f in own]},

@@ -60,7 +60,7 @@ STEPS: dict[StepName, Step] = {
     "poses": Step(
         find_poses,
         needs=("flow",),
-        settings=("poses", "masks", "matcher", "tripod"),
+        settings=("poses", "masks", "matcher", "tripod", "readout"),
         check=check_given_maps,
         outputs=("poses", "points.npy"),
         complete=all_have("c2w"),

@@ -119,6 +119,10 @@ class PrepareConfig:
     -0.2,0.03; or the file of a calibration: COLMAP's cameras.txt, nerfstudio's
     transforms.json, YAML or JSON of OpenCV, ROS or Kalibr. Frames are undistorted.
     """
+    readout: float = 0.0
+    """Milliseconds from a rolling shutter's first row to its last, which `hdr-nsff
+    check` measures: poses are those of the middle row, and `splat` is trained with it.
+    """
     matcher: Matcher = "sift"
     """What finds and matches keypoints for poses. sift: needs no weights; aliked, disk:
     learned, matched by LightGlue (extra `neural`), seconds per pair of frames on a CPU,
@@ -203,6 +207,11 @@ class Work:
     def folder(self) -> Path:
         """The scene folder."""
         return self.config.out
+
+    @property
+    def readout(self) -> float:
+        """Of the rolling shutter, from the first row to the last, in frames as used."""
+        return self.config.readout * 1e-3 / self.manifest.frame_interval
 
     def save(self) -> None:
         """Write the manifest."""

@@ -142,6 +142,9 @@ class Manifest(Strict):
     stride: int = Field(default=1, ge=1)  # every how manyth frame of the footage is used
     # seconds from one frame of the footage to the next, None where no clock shows them
     frame_seconds: float | None = Field(default=None, gt=0, le=1e6)
+    # milliseconds from a rolling shutter's first row to its last; poses are those of
+    # the middle row
+    readout: float = Field(default=0.0, ge=0, le=1000)
     cycle: int = Field(default=1, ge=1)  # length of the exposure cycle
     # still cameras of one make that took the frames in turn, 1: no rig
     rig: int = Field(default=1, ge=1)
@@ -160,6 +163,13 @@ class Manifest(Strict):
     lens: dict[int, LensEntry] = {}  # camera_id -> its lens, where frames were undistorted
     frames: list[FrameEntry] = []
     steps: dict[str, StepRecord] = {}
+
+    @property
+    def frame_interval(self) -> float:
+        """Seconds from one frame to the next, of those used."""
+        if self.frame_seconds is None:
+            return 1 / self.fps
+        return self.frame_seconds * self.stride
 
     @property
     def num_brackets(self) -> int:

@@ -79,8 +79,10 @@ class SplatConfig:
     """
     radiance: Advanced[Literal["exp", "sigmoid"]] = "exp"
     """Unbounded radiance, or one below 1."""
-    readout: Annotated[float, Ge(0), Le(1000), arg(aliases=("--readout",))] = 0.0
-    """Milliseconds from a rolling shutter's first row to its last."""
+    readout: Annotated[float | None, Ge(0), Le(1000), arg(aliases=("--readout",))] = None
+    """Milliseconds from a rolling shutter's first row to its last. Default: those that
+    `prepare --readout` was given, else 0.
+    """
     shutter: Annotated[Share | Literal["auto"], arg(aliases=("--shutter",))] = 0.0
     """Motion blur: share of the time from frame to frame of the clip for which the
     longest exposure takes light; auto: as the exposure times say, where a list, EXIF or

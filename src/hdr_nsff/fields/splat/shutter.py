@@ -66,9 +66,9 @@ class Timing:
     is one of those used, every `stride`th of the footage.
     """
 
-    fps: float  # frames a second, of those used
+    interval: float  # seconds from one frame to the next, of those used
     stride: int
-    frame_seconds: float | None  # from one frame of the footage to the next, if known
+    frame_seconds: float | None  # the same of the footage, where a clock shows it
     exposure_times: tuple[float | None, ...]  # (T,) seconds, None where unknown
     exposures: tuple[float, ...]  # (T,) log2, to any reference
 
@@ -89,10 +89,7 @@ def shutter_for(readout_ms: float, share: Share, timing: Timing) -> Shutter | No
     elif share:
         shares = tuple(share * time for time in relative_times(timing))
     open_for = tuple(own / timing.stride for own in shares)
-    interval = 1 / timing.fps
-    if timing.frame_seconds is not None:
-        interval = timing.frame_seconds * timing.stride
-    return Shutter(readout_ms * 1e-3 / interval, open_for)
+    return Shutter(readout_ms * 1e-3 / timing.interval, open_for)
 
 
 def known_shares(timing: Timing) -> tuple[float, ...]:

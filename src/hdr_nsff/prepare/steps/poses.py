@@ -92,6 +92,7 @@ def find_poses(work: Work) -> StepResult:
             "near": near,
             "far": far,
             "points": "points.npy" if len(poses.points) else None,
+            "readout": c.readout,
         },
         frames={
             "K": {f.index: K.tolist() for f, K in zip(m.frames, poses.K, strict=True)},
@@ -263,6 +264,7 @@ def estimate(work: Work, moving: np.ndarray, earlier: EarlierRounds | None = Non
         earlier=earlier,
         lens=lens,
         views=views,
+        readout=work.readout,
         tuning=tuning_of(work),
     )
     if poses.lenses:
@@ -292,6 +294,7 @@ def estimate_of_track(work: Work, moving: np.ndarray, earlier: EarlierRounds | N
         device=pick_device(work.config.device),
         earlier=earlier,
         lens=lens_to_find(work),
+        readout=work.readout,
         tuning=tuning_of(work),
     )
     if poses.lenses:

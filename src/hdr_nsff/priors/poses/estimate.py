@@ -107,6 +107,7 @@ def estimate_poses(
     earlier: EarlierRounds | None = None,
     lens: LensChoice = "none",
     views: SfmViews | None = None,
+    readout: float = 0.0,
 ) -> Poses:
     """Poses of every frame of `video` (T, H, W, 3), exposure-equalized rgb in [0, 1].
 
@@ -117,7 +118,8 @@ def estimate_poses(
     `workdir`. What `earlier` rounds on the same frames found is used again. A `lens`
     that was found or given is in `Poses.lenses`; undistort the frames, and estimate
     again. `views`: the images of a rig in turn, see `rig_views`, mapped instead of the
-    frames. InputError where poses cannot be estimated.
+    frames. `readout`: of a rolling shutter, in frames, for structure from motion; poses
+    are then those of the middle rows. InputError where poses cannot be estimated.
     """
     count = len(video)
     if count < MIN_FRAMES:
@@ -145,7 +147,7 @@ def estimate_poses(
         if share >= tuning.no_lens_share and lens == "auto":
             lens = "none"
         if views is None:
-            views = sfm_views(video, ignore, groups, tuning.reconstruction)
+            views = sfm_views(video, ignore, groups, tuning.reconstruction, readout)
         mapper = Mapper(
             views, Path(workdir), threads, matcher, tuning.reconstruction, device,
             earlier or EarlierRounds(),

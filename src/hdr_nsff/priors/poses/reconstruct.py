@@ -39,6 +39,7 @@ from hdr_nsff.priors.poses.matching import (
     sift_image,
     upsampling_factor,
 )
+from hdr_nsff.priors.poses.rolling_shutter import at_middle_rows
 from hdr_nsff.priors.poses.rotation import (
     RotationTuning,
     default_focal,
@@ -109,6 +110,7 @@ class SfmViews:
     groups: list[list[int]]  # views of each physical camera
     of_frame: np.ndarray  # (T,) the view of each frame
     visits: VisitImages | None = None  # of a rig: what is matched instead of the images
+    readout: float = 0.0  # of a rolling shutter, from the first row to the last, in frames
 
 
 def sfm_views(
@@ -116,14 +118,16 @@ def sfm_views(
     ignore: np.ndarray,
     groups: list[list[int]],
     tuning: ReconstructionTuning = ReconstructionTuning(),
+    readout: float = 0.0,
 ) -> SfmViews:
     """One view per frame; of a rig's cameras that stand still, one view per camera.
 
     That view is the median of the camera's frames, free of most movers. `video` (T, H,
-    W, 3) in [0, 1], `ignore` (T, H, W) bool; `groups`: frames of each camera.
+    W, 3) in [0, 1], `ignore` (T, H, W) bool; `groups`: frames of each camera;
+    `readout` of the rolling shutter, in frames.
     """
     if len(groups) == 1:
-        return SfmViews(video, ignore, groups, np.arange(len(video)))
+        return SfmViews(video, ignore, groups, np.arange(len(video)), readout=readout)
     medians: dict[int, np.ndarray] = {}
     frame_of: list[int] = []
     hidden: list[np.ndarray] = []
@@ -147,7 +151,7 @@ def sfm_views(
         return medians[view] if view in medians else video[frame_of[view]]
 
     images = Stack(image, (len(frame_of), *video.shape[1:]))
-    return SfmViews(images, np.stack(hidden), view_groups, of_frame)
+    return SfmViews(images, np.stack(hidden), view_groups, of_frame, readout=readout)
 
 
 def stands_still(video: ArrayStack, ignore: np.ndarray, tuning: ReconstructionTuning) -> bool:
@@ -358,6 +362,9 @@ def write_job(
         found = earlier.matches[key] = ViewMatches(keypoints, pairs, matches)
     masks = [keypoint_mask(i, scale, tuning.matching.mask_margin_px) for i in views.ignore]
     static = found.outside(masks)
+    if views.readout:
+        height = scale * views.images.shape[1]
+        static = at_middle_rows(static, views.groups, views.readout, height)
     sfm.write_matches(folder, names, static.keypoints, named_pairs, static.matches)
     return job
 

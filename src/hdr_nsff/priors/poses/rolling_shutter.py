@@ -1,0 +1,85 @@
+"""Keypoints as a camera without a rolling shutter would have seen them.
+
+Row y of frame t is recorded at t + r (y / H - 1/2), with r the readout in frames. Every
+keypoint is moved to where it was when the middle row was read, at the velocity that its
+matches with neighboring frames show. Structure from motion then finds the cameras of
+the middle rows, with which a field is trained.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from hdr_nsff.priors.poses.view_matches import ViewMatches
+
+MAX_GAP = 8  # frames between views whose matches show a keypoint's velocity; the nearest count
+NEIGHBORS = 5  # keypoints whose velocity stands for that of one without such matches
+
+
+def at_middle_rows(
+    found: ViewMatches, groups: Sequence[Sequence[int]], readout: float, height: int
+) -> ViewMatches:
+    """The keypoints of static points at the time of the middle row of their view.
+
+    `groups`: the views of each camera, in time, one per frame; `readout`: from the
+    first row to the last, in frames; `height`: of the images, pixels.
+    """
+    delays = [readout * (xy[:, 1] / height - 0.5) for xy in found.keypoints]
+    keypoints = [
+        xy - delay[:, None] * of_all(velocity, xy)
+        for xy, delay, velocity in zip(
+            found.keypoints, delays, velocities(found, groups, delays), strict=True
+        )
+    ]
+    return replace(found, keypoints=keypoints)
+
+
+def velocities(
+    found: ViewMatches, groups: Sequence[Sequence[int]], delays: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """The velocity (N, 2) of the keypoints of each view, pixels a frame, NaN where no
+    match shows it; `delays` (N,): when each was read, frames after the middle row.
+
+    The mean of those from the frame before and to the frame after, either of them where
+    the other is not known.
+    """
+    order = {view: (k, place) for k, group in enumerate(groups) for place, view in enumerate(group)}
+    before, after = ([np.full(xy.shape, np.nan) for xy in found.keypoints] for _ in range(2))
+    gaps = [
+        order[b][1] - order[a][1] if order[a][0] == order[b][0] else MAX_GAP + 1
+        for a, b in found.pairs
+    ]
+    nearest_last = sorted(range(len(gaps)), key=lambda k: -abs(gaps[k]))
+    for k in nearest_last:
+        (a, b), (rows, columns), gap = found.pairs[k], found.matches[k].T, gaps[k]
+        if abs(gap) > MAX_GAP:
+            continue
+        moved = found.keypoints[b][columns] - found.keypoints[a][rows]
+        velocity = moved / (gap + delays[b][columns] - delays[a][rows])[:, None]
+        (after if gap > 0 else before)[a][rows] = velocity
+        (before if gap > 0 else after)[b][columns] = velocity
+    return [mean_of_known(first, second) for first, second in zip(before, after, strict=True)]
+
+
+def mean_of_known(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """The mean of two arrays, either of them where the other is NaN."""
+    filled = np.where(np.isnan(first), second, first), np.where(np.isnan(second), first, second)
+    return (filled[0] + filled[1]) / 2
+
+
+def of_all(velocity: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    """The velocity (N, 2) of all keypoints `xy` (N, 2) of a view; where it is NaN, the
+    median of the nearest ones that have it, 0 where none has.
+    """
+    known = ~np.isnan(velocity[:, 0])
+    if not known.any():
+        return np.zeros_like(velocity)
+    count = min(NEIGHBORS, int(known.sum()))
+    _, nearest = KDTree(xy[known]).query(xy[~known], range(1, count + 1))
+    filled = velocity.copy()
+    filled[~known] = np.median(velocity[known][nearest], 1)
+    return filled
