@@ -195,6 +195,8 @@ def test_a_range_without_frames(tmp_path: Path, capsys: Capture) -> None:
     folder = clip(tmp_path / "clip")
     assert "no frame 50" in prepared(capsys, folder, "--start", 50)
     assert "nothing to read" in prepared(capsys, folder, "--start", 5, "--end", 5)
+    assert "--readout -1: give the milliseconds" in prepared(capsys, folder, "--readout", -1)
+    assert "--readout nan: give the milliseconds" in prepared(capsys, folder, "--readout", "nan")
     sentence = prepared(capsys, folder, "--start", 50)
     assert f"--start 50: no frame 50 in {folder}, which has 9, counted from 0" in sentence
     assert "--hold-out -3: no number of frames; use 2" in prepared(capsys, folder, "--hold-out", -3)

@@ -180,12 +180,17 @@ def test_shared_options_have_the_same_help(capsys: pytest.CaptureFixture[str]) -
         assert shown["prepare"][start:end][:100] in shown["run"], option
 
 
-def test_the_shutter_reaches_the_field_that_has_one(tmp_path: Path) -> None:
+def test_the_shutter_reaches_the_field_that_has_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     config = RunConfig(tmp_path / "clip.mp4", tmp_path / "out", readout=20.0, shutter=0.5)
     field = check_config(train_settings(config)).field
-    assert isinstance(field, SplatConfig) and (field.readout, field.shutter) == (20.0, 0.5)
+    assert isinstance(field, SplatConfig) and (field.readout, field.shutter) == (None, 0.5)
+    assert prepare_settings(config).readout == 20.0  # the field takes it from the scene
     with pytest.raises(InputError, match="--preset splat"):
         train_settings(replace(config, preset="grid"))
+    train_settings(replace(config, preset="grid", shutter=0.0))
+    assert "--readout: corrects the poses" in capsys.readouterr().err
     assert check_config(train_settings(replace(config, shutter="auto"))).field == replace(
         field, shutter="auto"
     )

@@ -1,10 +1,16 @@
 """Keypoints of rolling frames against a camera that sees all rows at once."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
+from test_prepare import footage, given
 
+from hdr_nsff.prepare.prepare import PrepareConfig, prepare
 from hdr_nsff.priors.poses.rolling_shutter import at_middle_rows
 from hdr_nsff.priors.poses.view_matches import ViewMatches
+from hdr_nsff.scene.manifest import Manifest
 
 HEIGHT, WIDTH, FOCAL = 90, 160, 140.0
 READOUT = 0.75
@@ -85,3 +91,11 @@ def test_matches_stay_as_they_are() -> None:
     same = at_middle_rows(found, [VIEWS], 0.0, HEIGHT)
     assert same.pairs == found.pairs and same.matches is found.matches
     assert all(np.array_equal(a, b) for a, b in zip(same.keypoints, found.keypoints, strict=True))
+
+
+def test_a_scene_keeps_the_readout_of_its_poses(tmp_path: Path) -> None:
+    clip = footage(tmp_path / "clip")
+    config = PrepareConfig(clip, tmp_path / "scene", hold_out=0, **given(tmp_path))
+    assert Manifest.load(prepare(config)).readout == 0
+    assert Manifest.load(prepare(replace(config, readout=20.0))).readout == 20
+    assert Manifest.load(prepare(config)).readout == 0

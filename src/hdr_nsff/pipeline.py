@@ -171,16 +171,19 @@ def train_settings(config: RunConfig) -> TrainConfig:
 
 
 def with_shutter(settings: TrainConfig, config: RunConfig) -> TrainConfig:
-    """The settings with the clip's shutter; InputError for a field that has none."""
-    if not config.readout and not config.shutter:
-        return settings
-    if not isinstance(settings.field, SplatConfig):
+    """The settings with the motion blur of the clip; InputError for a field that has
+    none. The readout of its rolling shutter comes with the scene.
+    """
+    if isinstance(settings.field, SplatConfig):
+        return replace(settings, field=replace(settings.field, shutter=config.shutter))
+    if config.shutter:
         raise InputError(
-            f"--readout, --shutter: --preset {config.preset} takes every frame for a moment; "
-            "choose --preset splat, or leave them out"
+            f"--shutter: --preset {config.preset} takes every frame for a moment; "
+            "choose --preset splat, or leave it out"
         )
-    shutter = replace(settings.field, shutter=config.shutter)
-    return replace(settings, field=shutter)
+    if config.readout:
+        say(f"--readout: corrects the poses; --preset {config.preset} takes frames for moments")
+    return settings
 
 
 def prepare_settings(config: RunConfig) -> PrepareConfig:
