@@ -79,6 +79,14 @@ def test_a_keypoint_without_near_matches_moves_as_those_around_it() -> None:
     assert after < 0.5 * before
 
 
+def test_matches_that_took_no_time_show_no_velocity() -> None:
+    top, bottom = np.array([[80.0, 0.0]]), np.array([[80.0, HEIGHT]])
+    row = np.zeros((1, 2), int)
+    found = ViewMatches([bottom, top], [(0, 1)], [row])  # read at the same moment
+    same = at_middle_rows(found, [[0, 1]], 1.0, HEIGHT)
+    assert np.array_equal(same.keypoints[0], bottom) and np.array_equal(same.keypoints[1], top)
+
+
 def test_views_of_two_cameras_show_no_velocity() -> None:
     recorded = [rolled(view) for view in VIEWS]
     found = matches_of(recorded, (1, 3, 5))

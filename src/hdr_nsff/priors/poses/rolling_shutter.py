@@ -17,6 +17,7 @@ from scipy.spatial import KDTree
 from hdr_nsff.priors.poses.view_matches import ViewMatches
 
 MAX_GAP = 8  # frames between views whose matches show a keypoint's velocity; the nearest count
+MIN_ELAPSED = 0.2  # share of the time between two frames; a match across more rows is wrong
 NEIGHBORS = 5  # keypoints whose velocity stands for that of one without such matches
 
 
@@ -59,7 +60,10 @@ def velocities(
         if abs(gap) > MAX_GAP:
             continue
         moved = found.keypoints[b][columns] - found.keypoints[a][rows]
-        velocity = moved / (gap + delays[b][columns] - delays[a][rows])[:, None]
+        elapsed = (gap + delays[b][columns] - delays[a][rows])[:, None]
+        velocity = np.divide(
+            moved, elapsed, out=np.full(moved.shape, np.nan), where=elapsed / gap > MIN_ELAPSED
+        )
         (after if gap > 0 else before)[a][rows] = velocity
         (before if gap > 0 else after)[b][columns] = velocity
     return [mean_of_known(first, second) for first, second in zip(before, after, strict=True)]
