@@ -8,8 +8,9 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.footage.colmap import ColmapCamera, ColmapModel
 from hdr_nsff.geometry.lens import Lens, distorted_picture
 from hdr_nsff.priors.poses import sfm
-from hdr_nsff.priors.poses.estimate import Mapper, PosesTuning, estimate_poses
+from hdr_nsff.priors.poses.estimate import PosesTuning, estimate_poses
 from hdr_nsff.priors.poses.lens import LensTuning, bent_cameras
+from hdr_nsff.priors.poses.mapper import Mapper
 from hdr_nsff.priors.poses.reconstruct import ReconstructionTuning
 
 LENS = Lens(posed_clips.K, (0.15, 0.0, 0.0, 0.0), posed_clips.W, posed_clips.H)

@@ -4,11 +4,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import posed_clips
 import pytest
 from test_prepare import footage, given
 
+from hdr_nsff.geometry.poses import Poses
 from hdr_nsff.prepare.prepare import PrepareConfig, prepare
-from hdr_nsff.priors.poses.rolling_shutter import at_middle_rows
+from hdr_nsff.prepare.steps.poses import read_round, write_round
+from hdr_nsff.priors.poses.estimate import estimate_poses
+from hdr_nsff.priors.poses.rolling_shutter import at_middle_rows, best_readout
 from hdr_nsff.priors.poses.view_matches import ViewMatches
 from hdr_nsff.scene.manifest import Manifest
 
@@ -99,6 +103,47 @@ def test_matches_stay_as_they_are() -> None:
     same = at_middle_rows(found, [VIEWS], 0.0, HEIGHT)
     assert same.pairs == found.pairs and same.matches is found.matches
     assert all(np.array_equal(a, b) for a, b in zip(same.keypoints, found.keypoints, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("least", "gain", "found"),
+    [(0.6, 0.09, 0.6), (1.1, 0.3, 1.1), (0.6, 0.01, 0.0), (-0.2, 0.1, 0.0), (1.6, 0.9, 0.0)],
+)
+def test_a_readout_is_where_the_error_is_least(least: float, gain: float, found: float) -> None:
+    """`gain`: the share by which the error falls from a readout of 0."""
+    squared = (1 - gain) ** 2, 1 - (1 - gain) ** 2
+    measured = best_readout(lambda r: (squared[0] + squared[1] * (1 - r / least) ** 2) ** 0.5)
+    assert measured == pytest.approx(found)
+
+
+def test_errors_that_have_no_least_value_mean_no_readout() -> None:
+    assert best_readout(lambda r: 1 - 0.1 * r**2) == best_readout(lambda r: 1.0) == 0
+
+
+def sliding(readout: float) -> np.ndarray:
+    """A painted clip (T, H, W, 3) whose rows are read one after the other, by bands."""
+    bands, frames = 12, np.arange(10)
+    clip = np.zeros((len(frames), posed_clips.H, posed_clips.W, 3), np.float32)
+    height = posed_clips.H // bands
+    for band in range(bands):
+        time = frames + readout * ((band + 0.5) / bands - 0.5)
+        shake = 0.15 * np.sin(time / 2), 0.1 * np.cos(time / 2)
+        places = np.stack([time / 9 - 0.5, *shake], 1)
+        rows = slice(band * height, (band + 1) * height)
+        clip[:, rows] = posed_clips.sliding(places)[:, rows]
+    return clip
+
+
+def test_structure_from_motion_measures_the_readout(tmp_path: Path) -> None:
+    found = estimate_poses(sliding(0.6), None, tmp_path, threads=1, readout="auto")
+    assert found.readout == pytest.approx(0.6, abs=0.1)
+
+
+def test_the_first_round_keeps_its_readout(tmp_path: Path) -> None:
+    K, c2w = np.tile(np.eye(3), (2, 1, 1)), np.tile(np.eye(4)[:3], (2, 1, 1))
+    poses = Poses(K, c2w, np.ones(2, bool), "full", readout=0.25)
+    write_round(tmp_path / "round.npz", poses, np.zeros((2, 8, 8), bool), {})
+    assert read_round(tmp_path / "round.npz")[0].readout == 0.25
 
 
 def test_a_scene_keeps_the_readout_of_its_poses(tmp_path: Path) -> None:

@@ -302,7 +302,7 @@ def judge_shutter(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
     advice = "move slower"
     if facts.file.interval_ms is not None:
         text += f", {readout * ms:.0f} ms"
-        advice += f", or give `--readout {readout * ms:.0f}` to `prepare` or `run`"
+        advice += f", or give `--readout {readout * ms:.0f}` (or auto) to `prepare` or `run`"
     yield Finding("note", "shutter", text, advice)
 
 

@@ -50,6 +50,7 @@ class Poses:
     # {camera_id: lens} where the frames turned out to be distorted: these poses are
     # then only the start
     lenses: dict[int, Lens] = field(default_factory=dict)
+    readout: float = 0.0  # of the rolling shutter that they were estimated with, in frames
 
 
 def format_ranges(numbers: list[int]) -> str:

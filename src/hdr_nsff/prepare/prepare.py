@@ -222,10 +222,10 @@ def check_settings(config: PrepareConfig) -> None:
         )
     parse_exposures(config.exposures, config.ev)
     parse_lens(config.lens_distortion)
-    if not 0 <= config.readout <= MAX_READOUT_MS:
+    if config.readout != "auto" and not 0 <= config.readout <= MAX_READOUT_MS:
         raise InputError(
             f"--readout {config.readout:g}: give the milliseconds from a rolling shutter's first "
-            f"row to its last, 0 to {MAX_READOUT_MS}"
+            f"row to its last, 0 to {MAX_READOUT_MS}, or auto"
         )
     if config.rig is not None and config.rig < 1:
         raise InputError(f"--rig {config.rig}: give the number of cameras, or 1 for one camera")

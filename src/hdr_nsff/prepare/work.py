@@ -20,6 +20,7 @@ from hdr_nsff.priors.flow.semantic import SemanticConfig
 from hdr_nsff.priors.flow.sources import FlowName
 from hdr_nsff.priors.masks.visits import StaticPictures, separate_movers
 from hdr_nsff.priors.poses.lightglue import Matcher
+from hdr_nsff.priors.poses.mapper import Readout
 from hdr_nsff.radiometry import exposure_cycle as exposure
 from hdr_nsff.scene.manifest import FlowFiles, FrameEntry, Manifest, Protocol
 from hdr_nsff.scene.posed_video import PosedVideo
@@ -119,9 +120,10 @@ class PrepareConfig:
     -0.2,0.03; or the file of a calibration: COLMAP's cameras.txt, nerfstudio's
     transforms.json, YAML or JSON of OpenCV, ROS or Kalibr. Frames are undistorted.
     """
-    readout: float = 0.0
-    """Milliseconds from a rolling shutter's first row to its last, which `hdr-nsff
-    check` measures: poses are those of the middle row, and `splat` is trained with it.
+    readout: float | Literal["auto"] = 0.0
+    """Milliseconds from a rolling shutter's first row to its last: poses are those of
+    the middle row, and `splat` is trained with it. auto: measured where the camera
+    moves through space, which takes poses up to twice as long.
     """
     matcher: Matcher = "sift"
     """What finds and matches keypoints for poses. sift: needs no weights; aliked, disk:
@@ -209,9 +211,12 @@ class Work:
         return self.config.out
 
     @property
-    def readout(self) -> float:
+    def readout(self) -> Readout:
         """Of the rolling shutter, from the first row to the last, in frames as used."""
-        return self.config.readout * 1e-3 / self.manifest.frame_interval
+        readout = self.config.readout
+        if readout == "auto":
+            return readout
+        return readout * 1e-3 / self.manifest.frame_interval
 
     def save(self) -> None:
         """Write the manifest."""

@@ -92,7 +92,7 @@ def find_poses(work: Work) -> StepResult:
             "near": near,
             "far": far,
             "points": "points.npy" if len(poses.points) else None,
-            "readout": c.readout,
+            "readout": 1e3 * m.frame_interval * poses.readout if c.readout == "auto" else c.readout,
         },
         frames={
             "K": {f.index: K.tolist() for f, K in zip(m.frames, poses.K, strict=True)},
@@ -167,6 +167,7 @@ def poses_and_masks(work: Work) -> Poses:
     cache = work.folder / FIRST_ROUND
     if cache.is_file():
         poses, before, earlier.model = read_round(cache)
+        earlier.readout = poses.readout
     else:
         before = share_masks(work, rough_mask(*work.raw_flows, work.equalized[0]))
         poses = estimate(work, before, earlier)
@@ -312,6 +313,7 @@ def write_round(path: Path, poses: Poses, moving: np.ndarray, model: Mapping[str
     """
     arrays = {name: np.asarray(getattr(poses, name)) for name in ARRAYS}
     arrays["range"] = np.array([poses.near or np.nan, poses.far or np.nan])
+    arrays["readout"] = np.array(poses.readout)
     arrays["words"] = np.array([poses.parallax, *poses.notes])
     arrays["moving"] = np.packbits(moving, axis=-1)
     arrays["width"] = np.array(moving.shape[-1])
@@ -328,7 +330,10 @@ def read_round(path: Path) -> tuple[Poses, np.ndarray, dict[str, bytes]]:
         packed, width = arrays["moving"], int(arrays["width"])
         moving = np.unpackbits(packed, axis=-1, count=width).astype(bool)
         values = {name: arrays[name] for name in ARRAYS}
+        readout = float(arrays["readout"]) if "readout" in arrays else 0.0
         stored = [name for name in arrays.files if name.startswith(MODEL)]
         model = {Path(name).name: arrays[name].tobytes() for name in stored}
-    poses = Poses(**values, parallax=parallax, near=near, far=far, notes=tuple(notes))
+    poses = Poses(
+        **values, parallax=parallax, near=near, far=far, notes=tuple(notes), readout=readout
+    )
     return poses, moving, model

@@ -10,7 +10,7 @@ near is 1.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -21,35 +21,19 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.progress import say
 from hdr_nsff.core.stack import ArrayStack, spread_frames
 from hdr_nsff.core.tensors import CPU
-from hdr_nsff.footage.colmap import ColmapModel
 from hdr_nsff.geometry.lens import Lens
 from hdr_nsff.geometry.pinhole import intrinsics
 from hdr_nsff.geometry.poses import Poses, interpolate
-from hdr_nsff.priors.poses.lens import (
-    PINHOLE,
-    LensChoice,
-    Mapping,
-    bent_cameras,
-    fitted_lens,
-    lens_fit,
-    lens_of,
-)
+from hdr_nsff.priors.poses.lens import LensChoice
 from hdr_nsff.priors.poses.lightglue import Matcher
+from hdr_nsff.priors.poses.mapper import Mapper, Readout, measured_readout
 from hdr_nsff.priors.poses.matching import (
     camera_groups,
     detect_keypoints,
     match_pairs,
     view_pairs,
 )
-from hdr_nsff.priors.poses.model_poses import poses_from_model
-from hdr_nsff.priors.poses.reconstruct import (
-    ReconstructionTuning,
-    SfmViews,
-    best_model,
-    median_error,
-    sfm_views,
-    views_of_images,
-)
+from hdr_nsff.priors.poses.reconstruct import ReconstructionTuning, SfmViews, sfm_views
 from hdr_nsff.priors.poses.rotation import (
     Panorama,
     RotationTuning,
@@ -58,7 +42,6 @@ from hdr_nsff.priors.poses.rotation import (
     fit_video,
     rotation_share,
 )
-from hdr_nsff.priors.poses.sfm import LENS_FILE
 from hdr_nsff.priors.poses.still_camera import (
     StillCameraTuning,
     nearly_still_shifts,
@@ -107,7 +90,7 @@ def estimate_poses(
     earlier: EarlierRounds | None = None,
     lens: LensChoice = "none",
     views: SfmViews | None = None,
-    readout: float = 0.0,
+    readout: Readout = 0.0,
 ) -> Poses:
     """Poses of every frame of `video` (T, H, W, 3), exposure-equalized rgb in [0, 1].
 
@@ -118,8 +101,9 @@ def estimate_poses(
     `workdir`. What `earlier` rounds on the same frames found is used again. A `lens`
     that was found or given is in `Poses.lenses`; undistort the frames, and estimate
     again. `views`: the images of a rig in turn, see `rig_views`, mapped instead of the
-    frames. `readout`: of a rolling shutter, in frames, for structure from motion; poses
-    are then those of the middle rows. InputError where poses cannot be estimated.
+    frames. `readout`: of a rolling shutter, in frames; structure from motion then finds
+    the cameras of the middle rows, and measures the readout where it is "auto".
+    InputError where poses cannot be estimated.
     """
     count = len(video)
     if count < MIN_FRAMES:
@@ -146,14 +130,22 @@ def estimate_poses(
     if poses is None:
         if share >= tuning.no_lens_share and lens == "auto":
             lens = "none"
+        earlier = earlier or EarlierRounds()
         if views is None:
-            views = sfm_views(video, ignore, groups, tuning.reconstruction, readout)
+            known = (earlier.readout or 0.0) if readout == "auto" else readout
+            views = sfm_views(video, ignore, groups, tuning.reconstruction, known)
         mapper = Mapper(
-            views, Path(workdir), threads, matcher, tuning.reconstruction, device,
-            earlier or EarlierRounds(),
+            views, Path(workdir), threads, matcher, tuning.reconstruction, device, earlier
         )  # fmt: skip
         try:
             poses = mapper.poses(lens)
+            if readout == "auto" and earlier.readout is None and not poses.lenses:
+                earlier.readout = measured_readout(mapper)
+                if earlier.readout:
+                    mapper = mapper.with_readout(earlier.readout)
+                    poses = mapper.poses("none")
+                    earlier.model = mapper.earlier.model
+            poses = replace(poses, readout=mapper.views.readout)
         except InputError as error:
             if is_one_camera:
                 poses = unmapped_poses(error, share, video, ignore, clipped, tuning, lens)
@@ -198,86 +190,6 @@ def rig_views(pictures: np.ndarray, visits: VisitImages, places: Sequence[int]) 
     """
     ignore = np.zeros(pictures.shape[:3], bool)
     return SfmViews(pictures, ignore, [list(range(len(pictures)))], np.asarray(places), visits)
-
-
-@dataclass(frozen=True)
-class Mapper:
-    """Structure from motion on the views of a clip, with a lens or without."""
-
-    views: SfmViews
-    workdir: Path
-    threads: int
-    matcher: Matcher
-    tuning: ReconstructionTuning
-    device: torch.device
-    earlier: EarlierRounds
-
-    def model(self, mapping: Mapping, earlier: EarlierRounds) -> tuple[ColmapModel, int]:
-        """The best reconstruction, and the scale of its images over the views."""
-        return best_model(
-            self.views, self.workdir, self.threads, self.matcher, self.tuning, self.device,
-            earlier, mapping,
-        )  # fmt: skip
-
-    def poses(self, lens: LensChoice) -> Poses:
-        """Poses of all frames, with the lens of each group of views where one is found
-        or given. InputError where there is no good reconstruction.
-        """
-        if not isinstance(lens, str):
-            return self.bent_poses(Mapping(distortion=lens))
-        if lens == "none":
-            return self.of_model(*self.model(PINHOLE, self.earlier))
-        try:
-            model, scale = self.model(Mapping(try_lens=True), self.earlier)
-        except InputError:  # perhaps it bends too much for a pinhole camera
-            poses = self.bent_poses(Mapping(distortion=(0.0, 0.0), refine=True, try_lens=True))
-            if not poses.lenses:
-                raise
-            return poses
-        fit = lens_fit(self.earlier)
-        bent = [] if fit is None else bent_cameras(fit, model, scale, self.tuning.lens)
-        if fit is not None and bent:
-            limit = self.tuning.lens.max_model_error_share * median_error(model, self.tuning)
-            try:
-                poses = self.bent_poses(bent[0], limit)
-            except InputError:  # the lens that fits the model of a pinhole has to do
-                lenses = self.lenses(model, lambda camera: fitted_lens(fit, model, camera))
-                poses = replace(self.of_model(model, scale), lenses=lenses)
-            if poses.lenses:
-                return poses
-        return self.of_model(model, scale)
-
-    def bent_poses(self, mapping: Mapping, max_error_px: float = np.inf) -> Poses:
-        """Poses of a reconstruction with a lens, which starts from the earlier one's if
-        there is one. Its lenses count unless they bend too little after all, or points
-        miss by more than `max_error_px` (median, pixels of the images).
-        """
-        start = {name: c for name, c in self.earlier.model.items() if name != LENS_FILE}
-        round_of_its_own = EarlierRounds(self.earlier.matches, start)
-        model, scale = self.model(mapping, round_of_its_own)
-        fit = lens_fit(round_of_its_own)
-        tuning = self.tuning.lens
-        lenses = self.lenses(model, lambda camera: lens_of(model, camera, fit, tuning))
-        poses = self.of_model(model, scale)
-        largest = max(lens.max_displacement_px() for lens in lenses.values())
-        bends = largest >= tuning.min_displacement_px or not mapping.refine
-        fits = median_error(model, self.tuning) <= max_error_px
-        return replace(poses, lenses=lenses) if bends and fits else poses
-
-    def lenses(self, model: ColmapModel, of_camera: Callable[[int], Lens]) -> dict[int, Lens]:
-        """The lens of each group of views, of the size of the frames."""
-        height, width = self.views.images.shape[1:3]
-        image_of = views_of_images(model)
-        lenses = {}
-        for k, group in enumerate(self.views.groups):
-            camera_ids = [image_of[v].camera_id for v in group if v in image_of]
-            lenses[k] = of_camera(camera_ids[0]).resized(width, height)
-        return lenses
-
-    def of_model(self, model: ColmapModel, scale: int) -> Poses:
-        """The poses of a reconstruction."""
-        height, width = self.views.images.shape[1:3]
-        return poses_from_model(model, self.views, scale, (height, width), self.tuning)
 
 
 def parallax_free_share(

@@ -67,6 +67,7 @@ class EarlierRounds:
     matches: dict[tuple[str, tuple[int, ...]], ViewMatches] = field(default_factory=dict)
     # the files of the model that was found, by name; empty: none
     model: dict[str, bytes] = field(default_factory=dict)
+    readout: float | None = None  # of the rolling shutter, in frames; None: not measured
 
 
 def choose_keyframes(
