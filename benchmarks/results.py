@@ -82,10 +82,11 @@ SECTIONS = (
         "`interior`, `splat` still rises by 0.2 and `grid` by 0.4 while the learning rate falls "
         "(`grid` ended at 27.2 / 21.8 after a third of this time), on `lamp` `grid` by 0.14. "
         "During the run: eight views after 1/8, 1/4, 1/2, 4/5 and all of it, one thread each. "
-        "No baseline reaches what `splat` has after an eighth, however long it trains. `splat` gains 1.8 dB on `interior` "
-        "after that and loses 0.4 on `lamp`, where `grid` ends 0.3 dB below it and 1.1 above it "
-        "on movers: priors limit both. HDR-HexPlane overfits `interior` from half of its run on; "
-        "its published protocol, the left half of views, is not ours.",
+        "No baseline reaches what `splat` has after an eighth, however long it trains. `splat` "
+        "gains 1.8 dB on `interior` after that and loses 0.4 on `lamp`, where `grid` ends 0.3 dB "
+        "below it and 1.1 above it on movers: priors limit both. HDR-HexPlane overfits "
+        "`interior` from half of its run on; its published protocol, the left half of views, is "
+        "not ours.",
         "hdr-nsff bench OUT --scenes SCENE --methods nerf-wt,hdr-hexplane,nsff,splat,grid --budget "
         "MINUTES --views 8",
         bench_convergence,
