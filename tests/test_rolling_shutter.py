@@ -146,9 +146,13 @@ def test_the_first_round_keeps_its_readout(tmp_path: Path) -> None:
     assert read_round(tmp_path / "round.npz")[0].readout == 0.25
 
 
-def test_a_scene_keeps_the_readout_of_its_poses(tmp_path: Path) -> None:
+def test_a_scene_keeps_the_readout_of_its_poses(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     clip = footage(tmp_path / "clip")
     config = PrepareConfig(clip, tmp_path / "scene", hold_out=0, **given(tmp_path))
     assert Manifest.load(prepare(config)).readout == 0
     assert Manifest.load(prepare(replace(config, readout=20.0))).readout == 20
+    assert Manifest.load(prepare(replace(config, readout="auto"))).readout == 0
+    assert "--readout auto: not measured" in capsys.readouterr().err  # the poses are given
     assert Manifest.load(prepare(config)).readout == 0

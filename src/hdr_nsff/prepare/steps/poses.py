@@ -69,6 +69,8 @@ def find_poses(work: Work) -> StepResult:
         poses, given = estimate(work, given_masks(work)), False
     else:
         poses, given = poses_and_masks(work), False
+    if c.readout == "auto" and (given or poses.parallax != "full"):
+        say("poses: --readout auto: not measured without structure from motion; taken for 0")
     known_range = bool(poses.near and poses.far)
     near, far = (poses.near, poses.far) if known_range else (SPHERE_NEAR, SPHERE_FAR)
     files = {}
@@ -92,7 +94,7 @@ def find_poses(work: Work) -> StepResult:
             "near": near,
             "far": far,
             "points": "points.npy" if len(poses.points) else None,
-            "readout": 1e3 * m.frame_interval * poses.readout if c.readout == "auto" else c.readout,
+            "readout": readout_of(work, poses),
         },
         frames={
             "K": {f.index: K.tolist() for f, K in zip(m.frames, poses.K, strict=True)},
@@ -100,6 +102,12 @@ def find_poses(work: Work) -> StepResult:
         },
         files=files,
     )
+
+
+def readout_of(work: Work, poses: Poses) -> float:
+    """The readout in milliseconds: as given, else as measured with the poses."""
+    given = work.config.readout
+    return 1e3 * work.manifest.frame_interval * poses.readout if given == "auto" else given
 
 
 def data_set_poses(work: Work) -> Poses:
