@@ -103,7 +103,7 @@ SECTIONS = (
         "`--shutter` apply only where they are given; the columns without the effect show what "
         "giving them by mistake costs. The last column is the ratio of training times with and "
         "without the model, on clips without the effect, while other programs were running. "
-        "With the readout known, rotations of the poses are off by 0.08 degrees instead of 0.29 "
+        "With the readout known, rotations of the poses are off by 0.10 degrees instead of 0.29 "
         "in `interior` (0.04 without the effect), by 0.25 instead of 0.45 in `lamp` (0.16). Blur "
         "leaves the model little to gain, since the shorter exposures are sharp: what `lamp` "
         "loses, it loses in preparation (with flow, depth and masks of the sharp clip the "

@@ -142,6 +142,7 @@ def estimate_poses(
             if readout == "auto" and earlier.readout is None and not poses.lenses:
                 earlier.readout = measured_readout(mapper)
                 if earlier.readout:
+                    earlier.model = {}  # its focal length suits rows that are read at once
                     mapper = mapper.with_readout(earlier.readout)
                     poses = mapper.poses("none")
                     earlier.model = mapper.earlier.model

@@ -108,7 +108,7 @@ class Mapper:
 
     def with_readout(self, readout: float) -> Mapper:
         """The same for a rolling shutter that takes `readout` frames from the first row
-        to the last, from the model that was found.
+        to the last, from the model that was found, if any.
         """
         earlier = EarlierRounds(self.earlier.matches, dict(self.earlier.model))
         return replace(self, views=replace(self.views, readout=readout), earlier=earlier)
