@@ -8,12 +8,16 @@ import posed_clips
 import pytest
 from test_prepare import footage, given
 
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.tensors import CPU
 from hdr_nsff.geometry.poses import Poses
 from hdr_nsff.prepare.prepare import PrepareConfig, prepare
 from hdr_nsff.prepare.steps.poses import read_round, write_round
 from hdr_nsff.priors.poses.estimate import estimate_poses
+from hdr_nsff.priors.poses.mapper import Mapper
+from hdr_nsff.priors.poses.reconstruct import ReconstructionTuning, SfmViews
 from hdr_nsff.priors.poses.rolling_shutter import at_middle_rows, best_readout
-from hdr_nsff.priors.poses.view_matches import ViewMatches
+from hdr_nsff.priors.poses.view_matches import EarlierRounds, ViewMatches
 from hdr_nsff.scene.manifest import Manifest
 
 HEIGHT, WIDTH, FOCAL = 90, 160, 140.0
@@ -137,6 +141,25 @@ def sliding(readout: float) -> np.ndarray:
 def test_structure_from_motion_measures_the_readout(tmp_path: Path) -> None:
     found = estimate_poses(sliding(0.6), None, tmp_path, threads=1, readout="auto")
     assert found.readout == pytest.approx(0.6, abs=0.1)
+
+
+def test_where_nothing_maps_with_a_readout_the_poses_stay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*_: object) -> Poses:
+        raise InputError("too few views")
+
+    nothing = np.zeros((2, 8, 8), bool)
+    views = SfmViews(np.zeros((2, 8, 8, 3)), nothing, [[0, 1]], np.arange(2))
+    earlier = EarlierRounds(model={"cameras.bin": b""})
+    mapper = Mapper(views, tmp_path, 1, "sift", ReconstructionTuning(), CPU, earlier)
+    poses = Poses(np.eye(3)[None], np.eye(4)[None, :3], np.ones(1, bool), "full")
+    for name in ("model", "poses"):
+        monkeypatch.setattr(Mapper, name, fail)
+        assert mapper.with_measured_readout(poses) is poses and earlier.readout == 0
+        assert "not measured, taken for none: too few views" in capsys.readouterr().err
+        monkeypatch.setattr(Mapper, "measured_readout", lambda _: 0.5)
+    assert earlier.model == {"cameras.bin": b""}
 
 
 def test_the_first_round_keeps_its_readout(tmp_path: Path) -> None:

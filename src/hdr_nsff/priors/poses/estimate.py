@@ -26,7 +26,7 @@ from hdr_nsff.geometry.pinhole import intrinsics
 from hdr_nsff.geometry.poses import Poses, interpolate
 from hdr_nsff.priors.poses.lens import LensChoice
 from hdr_nsff.priors.poses.lightglue import Matcher
-from hdr_nsff.priors.poses.mapper import Mapper, Readout, measured_readout
+from hdr_nsff.priors.poses.mapper import Mapper, Readout
 from hdr_nsff.priors.poses.matching import (
     camera_groups,
     detect_keypoints,
@@ -101,9 +101,8 @@ def estimate_poses(
     `workdir`. What `earlier` rounds on the same frames found is used again. A `lens`
     that was found or given is in `Poses.lenses`; undistort the frames, and estimate
     again. `views`: the images of a rig in turn, see `rig_views`, mapped instead of the
-    frames. `readout`: of a rolling shutter, in frames; structure from motion then finds
-    the cameras of the middle rows, and measures the readout where it is "auto".
-    InputError where poses cannot be estimated.
+    frames. `readout` of a rolling shutter, in frames: cameras are then those of the
+    middle rows; "auto" measures it. InputError where poses cannot be estimated.
     """
     count = len(video)
     if count < MIN_FRAMES:
@@ -111,11 +110,7 @@ def estimate_poses(
             f"{count} frames are too few to estimate poses from; "
             f"give at least {MIN_FRAMES}, or import poses (--poses)"
         )
-    ignore = np.zeros(video.shape[:3], bool)
-    for mask in (masks, clipped):
-        if mask is not None:
-            for t in range(count):
-                ignore[t] |= mask[t]
+    ignore = union(video.shape[:3], masks, clipped)
     cameras = camera_ids or [0] * count
     groups = camera_groups(cameras)
     poses, share, is_one_camera = None, 0.0, views is None and len(groups) == 1
@@ -140,13 +135,7 @@ def estimate_poses(
         try:
             poses = mapper.poses(lens)
             if readout == "auto" and earlier.readout is None and not poses.lenses:
-                earlier.readout = measured_readout(mapper)
-                if earlier.readout:
-                    earlier.model = {}  # its focal length suits rows that are read at once
-                    mapper = mapper.with_readout(earlier.readout)
-                    poses = mapper.poses("none")
-                    earlier.model = mapper.earlier.model
-            poses = replace(poses, readout=mapper.views.readout)
+                poses = mapper.with_measured_readout(poses)
         except InputError as error:
             if is_one_camera:
                 poses = unmapped_poses(error, share, video, ignore, clipped, tuning, lens)
@@ -157,6 +146,16 @@ def estimate_poses(
     for note in poses.notes:
         say(f"poses: {note}")
     return poses
+
+
+def union(shape: tuple[int, ...], *masks: ArrayStack | None) -> np.ndarray:
+    """Where any of the `masks` is true, (T, H, W) bool; None is nowhere."""
+    anywhere = np.zeros(shape, bool)
+    for mask in masks:
+        if mask is not None:
+            for t in range(len(anywhere)):
+                anywhere[t] |= mask[t]
+    return anywhere
 
 
 def unmapped_poses(

@@ -106,12 +106,50 @@ class Mapper:
         fits = median_error(model, self.tuning) <= max_error_px
         return replace(poses, lenses=lenses) if bends and fits else poses
 
-    def with_readout(self, readout: float) -> Mapper:
+    def with_readout(self, readout: float, model: dict[str, bytes]) -> Mapper:
         """The same for a rolling shutter that takes `readout` frames from the first row
-        to the last, from the model that was found, if any.
+        to the last, from the files of a `model`, if any.
         """
-        earlier = EarlierRounds(self.earlier.matches, dict(self.earlier.model))
+        earlier = EarlierRounds(self.earlier.matches, dict(model))
         return replace(self, views=replace(self.views, readout=readout), earlier=earlier)
+
+    def with_measured_readout(self, poses: Poses) -> Poses:
+        """Poses with the readout that fits best, which later rounds then know; the
+        `poses` that were found without where that is 0, or nothing can be mapped with
+        another.
+
+        Views are mapped anew: the focal length of before suits rows read at once.
+        """
+        earlier, readout = self.earlier, 0.0
+        try:
+            readout = self.measured_readout()
+            if readout:
+                rolling = self.with_readout(readout, {})
+                poses = rolling.poses("none")
+                earlier.model = rolling.earlier.model
+            rows = f"over {readout:.0%} of the time between frames" if readout else "at once"
+            say(f"poses: rolling shutter: rows are read {rows}")
+        except InputError as error:
+            readout = 0.0
+            say(f"poses: rolling shutter: not measured, taken for none: {error}")
+        earlier.readout = readout
+        return poses
+
+    def measured_readout(self) -> float:
+        """The readout in frames with which the views fit best, from the model that was
+        found; 0 where they hardly fit better than without. InputError where nothing can
+        be mapped with one.
+        """
+        if not self.earlier.model or self.views.visits is not None:
+            return 0.0
+
+        def error(readout: float) -> float:
+            """The mean reprojection error of all observations, in pixels."""
+            rolling = self.with_readout(readout, self.earlier.model)
+            model, _ = rolling.model(PINHOLE, rolling.earlier)
+            return float(np.average(model.errors, weights=model.track_lengths))
+
+        return best_readout(error)
 
     def lenses(self, model: ColmapModel, of_camera: Callable[[int], Lens]) -> dict[int, Lens]:
         """The lens of each group of views, of the size of the frames."""
@@ -126,23 +164,5 @@ class Mapper:
     def of_model(self, model: ColmapModel, scale: int) -> Poses:
         """The poses of a reconstruction."""
         height, width = self.views.images.shape[1:3]
-        return poses_from_model(model, self.views, scale, (height, width), self.tuning)
-
-
-def measured_readout(mapper: Mapper) -> float:
-    """The readout of a rolling shutter, in frames, with which the reconstruction that
-    `mapper` has found fits best; 0 where it hardly fits better than without.
-    """
-    if not mapper.earlier.model or mapper.views.visits is not None:
-        return 0.0
-
-    def error(readout: float) -> float:
-        """The mean reprojection error of all observations, in pixels."""
-        rolling = mapper.with_readout(readout)
-        model, _ = rolling.model(PINHOLE, rolling.earlier)
-        return float(np.average(model.errors, weights=model.track_lengths))
-
-    readout = best_readout(error)
-    found = f"over {readout:.0%} of the time between frames" if readout else "at once"
-    say(f"poses: rolling shutter: rows are read {found}")
-    return readout
+        poses = poses_from_model(model, self.views, scale, (height, width), self.tuning)
+        return replace(poses, readout=self.views.readout)
