@@ -22,8 +22,8 @@ MOVING_PER_PIXEL, MAX_MOVING = 0.15, 20_000
 # most, per frame by its pixels and in all (8 times as many are alive at a time), and in
 # the clip (hand-chosen on real clips with people)
 LOCAL_PER_PIXEL = 0.5
-LOCAL_PER_FRAME_PIXEL, MAX_LOCAL_PER_FRAME = 0.03, 4_000
-MAX_LOCAL = 400_000
+LOCAL_PER_FRAME_PIXEL, MAX_LOCAL_PER_FRAME = 0.03, 8_000
+MAX_LOCAL = 500_000
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class SplatConfig:
     """
     local: Annotated[int, Ge(0), Le(10**8)] | None = None
     """Time-local Gaussians, for movers that are not rigid; default: one for every two
-    of their pixels in all frames, at most 400,000.
+    of their pixels in all frames, at most 500,000.
     """
     bases: Count = 6
     """Shared rigid motions that the moving ones mix."""
