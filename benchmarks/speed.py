@@ -23,6 +23,7 @@ from record import Record, make_parser, restart_prepared
 
 from hdr_nsff.core import distributed
 from hdr_nsff.core.tensors import pick_device
+from hdr_nsff.fields.build import sized_for
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.training.budget import Budget
 from hdr_nsff.training.config import TrainConfig
@@ -62,6 +63,7 @@ def measure(preset: str, bf16: bool, scene: Scene, args: argparse.Namespace) -> 
         config = replace(
             PRESETS[preset], scene=args.scene, out=Path(folder), budget=budget, bf16=bf16
         )
+        config = replace(config, field=sized_for(config.field, scene))
         if args.rays is not None:
             config = replace(config, rays=args.rays, moving_rays=0)
         trainer = Trainer(config, scene, device, distributed.Ranks())

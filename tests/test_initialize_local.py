@@ -101,7 +101,7 @@ def test_the_count_follows_the_pixels_of_soft_movers(toy: Scene, soft: Scene) ->
     assert config.counts(10_000, 1_000, 20)[2] == 500
     assert config.counts(10_000, 100_000, 20)[2] == 6_000
     assert config.counts(640 * 360, 10**9, 50)[2] == 345_600
-    assert config.counts(640 * 360, 10**9, 200)[2] == 500_000
+    assert config.counts(640 * 360, 10**9, 200)[2] == 400_000
     assert config.counts(1280 * 720, 10**9, 50)[2] == 400_000
 
 
