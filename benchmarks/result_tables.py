@@ -304,3 +304,14 @@ def prepare_cost(document: Document) -> Lines:
     rows.append(["peak GB", *(number(row["peak_memory_gb"], 2) for row in every), "pixels"])
     sizes = [f"`{row['scene']}` ({row['frames']} x {row['pixels']:,})" for row in every]
     return table(["step", *sizes, "grows with"], rows)
+
+
+def training_speed(document: Document) -> Lines:
+    """Steps a second and peak memory of every preset on every clip."""
+    rows = []
+    for row in document["results"]:
+        clip = f"`{row['scene']}` ({row['frames']} x {row['pixels']:,})"
+        gaussians = f"{row['gaussians']:,}" if row["gaussians"] else "-"
+        numbers = number(row["steps_per_second"], 1), number(row["peak_memory_gb"], 2)
+        rows.append([clip, f"`{row['preset']}`", gaussians, *numbers])
+    return table(["clip", "preset", "static Gaussians", "steps a second", "peak GB"], rows)

@@ -1,8 +1,8 @@
-"""Training speed and memory of presets on a prepared scene.
+"""Training speed and memory of presets on prepared scenes.
 
-    python benchmarks/speed.py SCENE --preset grid splat --steps 100
+    python benchmarks/speed.py SCENE ... --preset grid splat --steps 100
 
-Counts steps and rays per second with every loss, after enough steps that kernels are
+Every measurement runs in a new process, whose peak memory counts from zero. Counts steps and rays per second with every loss, after enough steps that kernels are
 compiled and culling no longer changes. `--bf16` measures every preset once more in
 bfloat16. For `paper` it extrapolates to the published 250,000 steps (published: 15 h).
 """
@@ -10,6 +10,7 @@ bfloat16. For `paper` it extrapolates to the published 250,000 steps (published:
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import platform
 import resource
 import tempfile
@@ -19,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from record import Record, make_parser, restart_prepared
+from record import Record, make_parser, name_of, restart_prepared
 
 from hdr_nsff.core import distributed
 from hdr_nsff.core.tensors import pick_device
@@ -35,7 +36,7 @@ PUBLISHED_STEPS = 250_000
 
 def main() -> None:
     parser = make_parser(__doc__, "speed")
-    parser.add_argument("scene", type=Path, help="a prepared scene")
+    parser.add_argument("scene", type=Path, nargs="+", help="a prepared scene")
     parser.add_argument("--preset", nargs="+", default=["grid"], choices=PRESETS)
     parser.add_argument("--steps", type=int, default=100, help="steps that are timed")
     parser.add_argument("--warm-up", type=int, default=150, help="steps before these")
@@ -47,21 +48,25 @@ def main() -> None:
     args = parser.parse_args()
     restart_prepared()
     precisions = (False, True) if args.bf16 else (False,)
-    scene = Scene.open(args.scene)
     record = Record("speed", args, seed=TrainConfig.seed)
-    for preset in args.preset:
-        for bf16 in precisions:
-            record.add(measure(preset, bf16, scene, args))
+    for folder in args.scene:
+        for preset in args.preset:
+            for bf16 in precisions:
+                with multiprocessing.get_context("spawn").Pool(1) as pool:
+                    record.add(pool.apply(measure, (folder, preset, bf16, args)))
     record.save()
 
 
-def measure(preset: str, bf16: bool, scene: Scene, args: argparse.Namespace) -> dict[str, Any]:
-    """Steps and rays per second of one preset, and the process's peak memory so far."""
+def measure(
+    scene_folder: Path, preset: str, bf16: bool, args: argparse.Namespace
+) -> dict[str, Any]:
+    """Steps and rays per second of one preset on a scene, and the process's peak memory."""
+    scene = Scene.open(scene_folder)
     device = pick_device(args.device)
     budget = Budget(steps=2 * (args.warm_up + args.steps), minutes=None)
     with tempfile.TemporaryDirectory() as folder:
         config = replace(
-            PRESETS[preset], scene=args.scene, out=Path(folder), budget=budget, bf16=bf16
+            PRESETS[preset], scene=scene_folder, out=Path(folder), budget=budget, bf16=bf16
         )
         config = replace(config, field=sized_for(config.field, scene))
         if args.rays is not None:
@@ -72,6 +77,10 @@ def measure(preset: str, bf16: bool, scene: Scene, args: argparse.Namespace) -> 
     whole_frame = scene.train[0].camera.width * scene.train[0].camera.height
     rays = (config.rays + config.moving_rays or whole_frame) * config.batches
     result = {
+        "scene": name_of(scene_folder),
+        "pixels": whole_frame,
+        "frames": len(scene.train),
+        "gaussians": getattr(config.field, "static", None),  # static ones
         "preset": preset,
         "bf16": bf16,
         "device": device_name(device),

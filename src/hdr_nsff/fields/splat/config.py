@@ -11,8 +11,8 @@ from tyro.conf import arg
 from hdr_nsff.core.settings import Advanced, Count, Number, Rate, Share, Weight
 
 # default number of static Gaussians: per pixel of a frame, times the mean density that
-# the pictures' detail asks for, and at most (hand-chosen: in two minutes on one core, 60 %
-# more gain 0.1 dB on real clips and 40 % less cost 0.1 to 0.3, but they also take time)
+# the pictures' detail asks for, and at most (hand-chosen: in two minutes on one core,
+# 60 % more gain 0.1 dB on real clips, 40 % less cost 0.1 to 0.3)
 STATIC_PER_PIXEL, MAX_STATIC = 0.9, 160_000
 TYPICAL_DETAIL = 0.6  # that density, relative to the greatest, on real clips
 # default number of moving ones, per pixel of a frame and at most (hand-chosen on
