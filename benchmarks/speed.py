@@ -2,8 +2,9 @@
 
     python benchmarks/speed.py SCENE ... --preset grid splat --steps 100
 
-Every measurement runs in a new process, whose peak memory counts from zero. Counts steps and rays per second with every loss, after enough steps that kernels are
-compiled and culling no longer changes. `--bf16` measures every preset once more in
+Every measurement runs in a new process, whose peak memory counts from zero. Counts
+steps and rays per second with every loss, after enough steps that kernels are compiled
+and culling no longer changes. `--bf16` measures every preset once more in
 bfloat16. For `paper` it extrapolates to the published 250,000 steps (published: 15 h).
 """
 
@@ -60,7 +61,7 @@ def main() -> None:
 def measure(
     scene_folder: Path, preset: str, bf16: bool, args: argparse.Namespace
 ) -> dict[str, Any]:
-    """Steps and rays per second of one preset on a scene, and the process's peak memory."""
+    """Steps and rays per second of one preset on a scene, and peak memory so far."""
     scene = Scene.open(scene_folder)
     device = pick_device(args.device)
     budget = Budget(steps=2 * (args.warm_up + args.steps), minutes=None)
