@@ -207,7 +207,7 @@ SECTIONS = (
         "Training with every loss. In brackets: training frames and pixels. `gopro` is a walk, "
         "`treadmill` two people before a still camera (a clip of the package `pose2sim`, "
         "re-exposed), who are 400,000 more Gaussians over the clip.",
-        "python benchmarks/speed.py SCENE ... --preset splat --steps 80 --warm-up 60",
+        "python benchmarks/speed.py SCENE ... --preset splat --steps 120 --warm-up 60",
         training_speed,
     ),
     Section(
