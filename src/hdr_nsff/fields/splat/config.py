@@ -14,7 +14,7 @@ from hdr_nsff.core.settings import Advanced, Count, Number, Rate, Share, Weight
 # the pictures' detail asks for, and at most (hand-chosen: in two minutes on one core,
 # 60 % more gain 0.1 dB on real clips, 40 % less cost 0.1 to 0.3)
 STATIC_PER_PIXEL, MAX_STATIC = 0.9, 160_000
-TYPICAL_DETAIL = 0.6  # that density, relative to the greatest, on real clips
+TYPICAL_DETAIL = 0.55 / 0.9  # that mean density on real clips, where none is known
 # default number of moving ones, per pixel of a frame and at most (hand-chosen on
 # rendered scenes)
 MOVING_PER_PIXEL, MAX_MOVING = 0.15, 20_000
