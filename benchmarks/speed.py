@@ -2,16 +2,15 @@
 
     python benchmarks/speed.py SCENE ... --preset grid splat --steps 100
 
-Every measurement runs in a new process, whose peak memory counts from zero. Counts
-steps and rays per second with every loss, after enough steps that kernels are compiled
-and culling no longer changes. `--bf16` measures every preset once more in
-bfloat16. For `paper` it extrapolates to the published 250,000 steps (published: 15 h).
+Counts steps and rays per second with every loss, after enough steps that kernels are
+compiled and culling no longer changes. The peak memory is that of the process so far:
+name the smallest scene first. `--bf16` measures every preset once more in bfloat16.
+For `paper` it extrapolates to the published 250,000 steps (published: 15 h).
 """
 
 from __future__ import annotations
 
 import argparse
-import multiprocessing
 import platform
 import resource
 import tempfile
@@ -53,8 +52,7 @@ def main() -> None:
     for folder in args.scene:
         for preset in args.preset:
             for bf16 in precisions:
-                with multiprocessing.get_context("spawn").Pool(1) as pool:
-                    record.add(pool.apply(measure, (folder, preset, bf16, args)))
+                record.add(measure(folder, preset, bf16, args))
     record.save()
 
 
