@@ -311,7 +311,6 @@ def training_speed(document: Document) -> Lines:
     rows = []
     for row in document["results"]:
         clip = f"`{row['scene']}` ({row['frames']} x {row['pixels']:,})"
-        gaussians = f"{row['gaussians']:,}" if row["gaussians"] else "-"
         numbers = number(row["steps_per_second"], 1), number(row["peak_memory_gb"], 2)
-        rows.append([clip, f"`{row['preset']}`", gaussians, *numbers])
-    return table(["clip", "preset", "static Gaussians", "steps a second", "peak GB"], rows)
+        rows.append([clip, f"`{row['preset']}`", *numbers])
+    return table(["clip", "preset", "steps a second", "peak GB"], rows)

@@ -204,9 +204,9 @@ SECTIONS = (
     Section(
         "speed",
         "Steps a second at 640x360",
-        "Training with every loss. In brackets: training frames and pixels. `gopro` is a walk, "
-        "`treadmill` two people before a still camera (a clip of the package `pose2sim`, "
-        "re-exposed), who are 400,000 more Gaussians over the clip.",
+        "Training with every loss and 80,000 static Gaussians. In brackets: training frames and "
+        "pixels. `gopro` is a walk, `treadmill` two people before a still camera (a clip of the "
+        "package `pose2sim`, re-exposed), who are 400,000 more Gaussians over the clip.",
         "python benchmarks/speed.py SCENE ... --preset splat --steps 120 --warm-up 60",
         training_speed,
     ),

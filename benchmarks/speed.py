@@ -24,7 +24,6 @@ from record import Record, make_parser, name_of, restart_prepared
 
 from hdr_nsff.core import distributed
 from hdr_nsff.core.tensors import pick_device
-from hdr_nsff.fields.build import sized_for
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.training.budget import Budget
 from hdr_nsff.training.config import TrainConfig
@@ -67,7 +66,6 @@ def measure(
         config = replace(
             PRESETS[preset], scene=scene_folder, out=Path(folder), budget=budget, bf16=bf16
         )
-        config = replace(config, field=sized_for(config.field, scene))
         if args.rays is not None:
             config = replace(config, rays=args.rays, moving_rays=0)
         trainer = Trainer(config, scene, device, distributed.Ranks())
@@ -79,7 +77,6 @@ def measure(
         "scene": name_of(scene_folder),
         "pixels": whole_frame,
         "frames": len(scene.train),
-        "gaussians": getattr(config.field, "static", None),  # static ones
         "preset": preset,
         "bf16": bf16,
         "device": device_name(device),

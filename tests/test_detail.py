@@ -1,23 +1,17 @@
 """Static Gaussians start closer where the pictures have detail."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 from torch import Tensor
 
-from hdr_nsff.fields.build import sized_for
 from hdr_nsff.fields.point_cloud import PointCloud
-from hdr_nsff.fields.splat.config import SplatConfig, num_static
 from hdr_nsff.fields.splat.detail import (
     HALF_DENSITY_DETAIL,
     SIZES_PER_OCTAVE,
     cell_sizes,
     detail_density,
-    mean_density,
     scale_by_size,
 )
-from hdr_nsff.scene.scene import Scene
 
 WIDTH = 64
 
@@ -55,27 +49,6 @@ def test_a_checkerboard_of_the_half_density_detail_asks_for_half() -> None:
     image = 0.5 + HALF_DENSITY_DETAIL / (1 - 1 / 81) * board
     middle = detail_density(image).view(32, 32)[8:-8, 8:-8]
     torch.testing.assert_close(middle, torch.full_like(middle, 0.5), atol=1e-4, rtol=0)
-
-
-def test_a_clip_needs_the_mean_of_its_frames_by_the_trust_in_their_pixels(toy: Scene) -> None:
-    frames = [replace(toy.train[0], image=half_noisy(c)) for c in (0.0, 0.02, 0.0)]
-    dense = float(detail_density(frames[1].image).mean())
-    assert mean_density([frames[0]]) < 1e-3
-    assert mean_density([frames[1]]) == pytest.approx(dense, rel=0.05)  # all are trusted
-    assert mean_density(frames) == pytest.approx(dense / 3, rel=0.05)
-    clipped = replace(frames[0], image=torch.ones(32, WIDTH, 3))
-    assert mean_density([frames[1], clipped]) == pytest.approx(dense, rel=0.1)
-
-
-def test_the_count_of_a_clip_follows_its_detail(toy: Scene) -> None:
-    config = sized_for(SplatConfig(), toy)
-    assert isinstance(config, SplatConfig)
-    pixels = toy.manifest.width * toy.manifest.height
-    assert config.static == round(0.9 * mean_density(toy.train) * pixels)
-    assert sized_for(SplatConfig(static=7), toy) == SplatConfig(static=7)
-    assert num_static(10_000, 0.25) == 2_250
-    assert num_static(10_000, 0.0) == 1
-    assert num_static(10**9, 0.5) == 160_000
 
 
 @pytest.mark.parametrize(("density", "octaves"), [(1.0, 0.0), (0.25, 1.0), (0.0, 3.0)])

@@ -18,8 +18,7 @@ from hdr_nsff.fields.nsff.nsff import NSFF, NSFFConfig
 from hdr_nsff.fields.point_cloud import ToRadiance
 from hdr_nsff.fields.space import build_space
 from hdr_nsff.fields.splat import cuda_backends
-from hdr_nsff.fields.splat.config import SplatConfig, num_static
-from hdr_nsff.fields.splat.detail import mean_density
+from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.initialize_gaussians import initialize_gaussians
 from hdr_nsff.fields.splat.initialize_local import count_local_pixels, limit_rigid_movers
 from hdr_nsff.fields.splat.shutter import Shutter, Timing, shutter_for
@@ -53,16 +52,6 @@ def check_scene(config: FieldConfig, scene: Scene) -> None:
     """InputError where a field needs to know more of a scene than this one says."""
     if isinstance(config, SplatConfig):
         scene_shutter(config, scene)
-
-
-def sized_for(config: FieldConfig, scene: Scene) -> FieldConfig:
-    """The settings with the number of static Gaussians that the detail of the scene's
-    frames asks for, where they leave it open.
-    """
-    if not isinstance(config, SplatConfig) or config.static is not None:
-        return config
-    num_pixels = scene.manifest.width * scene.manifest.height
-    return replace(config, static=num_static(num_pixels, mean_density(scene.train)))
 
 
 def build_field(config: FieldConfig, scene: Scene) -> AnyField:

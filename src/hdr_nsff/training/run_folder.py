@@ -24,7 +24,6 @@ from hdr_nsff.core.notes import LogLine
 from hdr_nsff.fields.base import RadianceField
 from hdr_nsff.fields.build import build_field, device_for
 from hdr_nsff.fields.outputs import record_pixels
-from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.scene.scene import Frame, Scene
 from hdr_nsff.tonemap.base import ToneMapper
 from hdr_nsff.tonemap.build import tone_mapper_for
@@ -101,14 +100,14 @@ class Run:
 def open_folder(config: TrainConfig) -> None:
     """Start a run folder, or check that an existing one has these settings and scene.
 
-    The path of a scene that has moved is updated. What is left open is that of the run.
+    The path of a scene that has moved is updated. An open budget is that of the run.
     """
     out = config.out
     if (out / SCENE_FILE).exists():
         raise InputError(f"{out}: holds a scene; choose another --out for the run")
-    if is_begun(out):
+    if (out / CONFIG).exists():
         before, places = stored_config(out)
-        config = with_own_choices(config)
+        config = with_own_budget(config)
         if replace(before, scene=config.scene, out=out, device=config.device) != config:
             raise InputError(
                 f"{out}: holds a run with other settings; "
@@ -123,21 +122,10 @@ def open_folder(config: TrainConfig) -> None:
     write_config(out, config)
 
 
-def is_begun(out: Path) -> bool:
-    """Whether a folder holds a run, finished or not."""
-    return (out / CONFIG).is_file()
-
-
-def with_own_choices(config: TrainConfig) -> TrainConfig:
-    """The settings; an open budget and an open number of static Gaussians become those
-    of the run in the folder.
-    """
-    before, _ = stored_config(config.out)
-    if config.budget == Budget():
-        config = replace(config, budget=before.budget)
-    match config.field, before.field:
-        case SplatConfig(static=None) as field, SplatConfig() as own:
-            config = replace(config, field=replace(field, static=own.static))
+def with_own_budget(config: TrainConfig) -> TrainConfig:
+    """The settings; an open budget becomes that of the run in the folder, if any."""
+    if config.budget == Budget() and (config.out / CONFIG).is_file():
+        return replace(config, budget=stored_config(config.out)[0].budget)
     return config
 
 

@@ -21,7 +21,7 @@ from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.process import limit_torch_threads
 from hdr_nsff.core.tensors import computes_bf16_fast, to_device
 from hdr_nsff.fields.base import FrameError
-from hdr_nsff.fields.build import build_field, check_scene, device_for, sized_for
+from hdr_nsff.fields.build import build_field, check_scene, device_for
 from hdr_nsff.scene.batch import PixelBatch
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.build import tone_mapper_for
@@ -60,10 +60,7 @@ def train(config: TrainConfig, keep_at: Sequence[float] = (), previews: bool = T
         scene = Scene.open(config.scene)
         check_scene(config.field, scene)
         camera = scene.train[0].camera
-        if run_folder.is_begun(config.out):
-            config = run_folder.with_own_choices(config)
-        else:
-            config = replace(config, field=sized_for(config.field, scene))
+        config = run_folder.with_own_budget(config)
         budget = config.budget.for_clip(camera.width * camera.height, len(scene.train))
         config = replace(config, budget=budget)
         if ranks.main:

@@ -10,13 +10,9 @@ from tyro.conf import arg
 
 from hdr_nsff.core.settings import Advanced, Count, Number, Rate, Share, Weight
 
-# default number of static Gaussians: per pixel of a frame, times the mean density that
-# the pictures' detail asks for, and at most (hand-chosen: in two minutes on one core,
-# 60 % more gain 0.1 dB on real clips, 40 % less cost 0.1 to 0.3)
-STATIC_PER_PIXEL, MAX_STATIC = 0.9, 160_000
-TYPICAL_DETAIL = 0.55 / 0.9  # that mean density on real clips, where none is known
-# default number of moving ones, per pixel of a frame and at most (hand-chosen on
-# rendered scenes)
+# default number of Gaussians, per pixel of a frame and at most (hand-chosen on rendered
+# scenes, for minutes of training on a CPU)
+STATIC_PER_PIXEL, MAX_STATIC = 0.55, 80_000
 MOVING_PER_PIXEL, MAX_MOVING = 0.15, 20_000
 # default number of time-local Gaussians, per pixel of their masks in all frames; at
 # most, per frame by its pixels and in all (8 times as many are alive at a time), and in
@@ -57,9 +53,7 @@ class SplatConfig:
     type: Advanced[Literal["splat"]] = "splat"
     loss: Advanced[SplatLosses] = field(default_factory=SplatLosses)
     static: Annotated[int, Ge(1), Le(10**8)] | None = None
-    """Static Gaussians; default: by the detail of the frames, about one for every two
-    pixels of one, at most 160,000.
-    """
+    """Static Gaussians; default: 0.55 for every pixel of a frame, at most 80,000."""
     moving: Annotated[int, Ge(0), Le(10**8)] | None = None
     """Moving Gaussians, for rigid movers; default: 0.15 for every pixel of a frame, or
     none.
@@ -121,7 +115,7 @@ class SplatConfig:
         """
         static, moving, local = self.static, self.moving, self.local
         if static is None:
-            static = num_static(num_pixels, TYPICAL_DETAIL)
+            static = min(round(STATIC_PER_PIXEL * num_pixels), MAX_STATIC)
         if moving is None:
             moving = min(round(MOVING_PER_PIXEL * num_pixels), MAX_MOVING)
         if local is None:
@@ -129,10 +123,3 @@ class SplatConfig:
             at_most = min(round(per_frame * num_frames), MAX_LOCAL)
             local = min(round(LOCAL_PER_PIXEL * local_pixels), at_most)
         return static, moving, local
-
-
-def num_static(num_pixels: int, detail: float) -> int:
-    """How many static Gaussians frames of `num_pixels` get by default, by the mean
-    relative density in [0, 1) that their `detail` asks for.
-    """
-    return min(max(round(STATIC_PER_PIXEL * detail * num_pixels), 1), MAX_STATIC)

@@ -4,20 +4,15 @@ Gaussians at a distance h leave an error of about h times the local contrast of 
 picture. Of a given number of them, the sum of squared errors is then least where their
 density is proportional to the contrast. Other errors (wrong depth, noise) limit what
 density gains, so that it levels off. Where a surface is seen in several frames, these
-vote by the trust in their pixels: one that clips shows no detail. The mean over a
-clip's frames says how many Gaussians it needs.
+vote by the trust in their pixels: one that clips shows no detail.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor, nn
 
-from hdr_nsff.core.stack import spread_frames
-from hdr_nsff.fields.point_cloud import PointCloud, exposure_trust
-from hdr_nsff.scene.scene import Frame
+from hdr_nsff.fields.point_cloud import PointCloud
 
 # root mean square of an image, in [0, 1], without its low frequencies, at which the
 # density is half of the greatest (hand-chosen: 5 levels of 255)
@@ -27,7 +22,6 @@ BLUR_PX = 3  # width of the box that separates low frequencies, applied twice
 WINDOW_PX = 7  # width of the window in which detail is measured
 VOTE_PX = 8.0  # side of the cells in which points vote on one density
 SIZES_PER_OCTAVE = 2  # how finely cell sizes differ
-NUM_FRAMES = 24  # training frames whose detail is averaged, evenly spread
 
 
 def detail_density(image: Tensor) -> Tensor:
@@ -37,20 +31,6 @@ def detail_density(image: Tensor) -> Tensor:
     energy = box_mean(high.square().mean(1, keepdim=True), WINDOW_PX)
     detail = energy.sqrt().flatten()
     return detail / (detail + HALF_DENSITY_DETAIL)
-
-
-def mean_density(frames: Sequence[Frame]) -> float:
-    """The mean relative density, in [0, 1), that the detail of a clip asks for.
-
-    Every pixel counts by the trust in what it recorded.
-    """
-    weighted, total = 0.0, 0.0
-    for i in spread_frames(len(frames), NUM_FRAMES):
-        image = frames[i].image
-        trust = exposure_trust(image.flatten(0, 1))
-        weighted += float((trust * detail_density(image)).sum())
-        total += float(trust.sum())
-    return weighted / total
 
 
 def box_mean(planes: Tensor, width: int) -> Tensor:
