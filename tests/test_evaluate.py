@@ -163,6 +163,21 @@ def test_training_views_are_named_as_such(tmp_path: Path) -> None:
     assert result["headline"]["psnr"] > 50 and "absent" in result["lpips"]
 
 
+def test_training_views_are_of_all_exposures(tmp_path: Path) -> None:
+    result = evaluate_run(fake_run(tmp_path / "run", num_frames=36), None)
+    frames = [int(view["name"]) for view in result["views"]]
+    assert len(frames) == 9 and {frame % 3 for frame in frames} == {0, 1, 2}
+
+
+def test_of_true_exposures_that_the_scene_does_not_tell_apart_the_views_own_counts(
+    tmp_path: Path,
+) -> None:
+    run = fake_run(tmp_path / "run")  # brackets at EV -4, -2, 0
+    truth = write_truth(tmp_path / "truth", run, field_of(run), bracket_ev=[-4, -2, -1.2, 0])
+    (view,) = (v for v in evaluate_run(run, truth)["views"] if v["name"] == "a")
+    assert view["psnr"] > 55
+
+
 def test_tripod_views_off_the_path_are_left_out_by_name(tmp_path: Path) -> None:
     run = fake_run(tmp_path / "run", parallax="none")
     result = evaluate_run(run, write_truth(tmp_path / "truth", run, field_of(run)))

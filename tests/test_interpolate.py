@@ -13,7 +13,7 @@ from torch import Tensor
 
 from hdr_nsff.fields.outputs import Layers
 from hdr_nsff.geometry.cameras import Camera
-from hdr_nsff.rendering.interpolate import Mode, Picture, neighbors, render_at, splat
+from hdr_nsff.rendering.interpolate import Mode, Picture, flow_duration, neighbors, render_at, splat
 
 CAMERA = camera()
 
@@ -22,6 +22,16 @@ def red_center(radiance: Tensor) -> Tensor:
     """The centroid (x, y) in pixels of the pixels redder than the wall."""
     weight = (radiance[:, 0] - radiance[:, 1]).clamp_min(0)[:, None]
     return (CAMERA.pixel_grid() * weight).sum(0) / weight.sum()
+
+
+def test_between_two_training_times_that_are_all_scene_flow_spans_them() -> None:
+    field = DiscBeforeWall()
+    at_start = field.render(CAMERA, 0.0).scene_flow
+    between = render_at(field, CAMERA, 0.5, [0.0, 2.0], "splat").scene_flow
+    assert flow_duration(1.0, 1, [0.0, 2.0]) == flow_duration(1.0, -1, [0.0, 2.0]) == 2
+    for side, flow in between.items():
+        assert torch.isfinite(flow).all()
+        torch.testing.assert_close(flow.abs().max(), at_start[side].abs().max())
 
 
 @pytest.mark.parametrize("fraction", [0.25, 0.5, 0.8])

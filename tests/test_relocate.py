@@ -22,6 +22,7 @@ from hdr_nsff.fields.splat.relocate import (
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.scene import Scene
+from hdr_nsff.training.measure import spread_frames
 
 
 def frame_error(
@@ -144,6 +145,13 @@ def test_training_relocates_until_late_in_the_run(
         t.clock = replace(t.clock, step=t.clock.step + 1)
     assert behind[3] < 40  # at most 20 of 400 find a place at a time
     assert behind[-1] >= 10 and behind[-2] >= 10  # from 80 % on nothing is relocated
+
+
+@pytest.mark.parametrize("num_frames", [1, 2, 11, 23, 24, 60])
+def test_errors_are_taken_of_all_frames_in_turn(num_frames: int) -> None:
+    chosen = [spread_frames(24, num_frames, step) for step in range(0, 4000, 200)]
+    assert {len(positions) for positions in chosen} == {min(24, num_frames)}
+    assert {p for positions in chosen for p in positions} == set(range(num_frames))
 
 
 def test_frame_errors_are_the_recorded_differences(

@@ -33,18 +33,18 @@ CAMERA = Camera(torch.tensor([[60.0, 0, 20], [0, 60, 15], [0, 0, 1]]), torch.eye
 BESIDE = CAMERA.moved(torch.tensor([[1.0, 0, 0, 0.2], [0, 1, 0, -0.1], [0, 0, 1, 0.05]]))
 
 
-def card_field(bases: int = 2) -> Splat:
+def card_field(bases: int = 2, times: int = TIMES) -> Splat:
     """A card of opaque Gaussians at z = 2 that moves by `STEP`, in front of a wall at z
     = 4 that fills the view.
     """
     config = SplatConfig(static=33 * 25, moving=121, bases=bases)
-    field = Splat(config, torch.arange(TIMES), 1.0, 6.0, 1200)
+    field = Splat(config, torch.arange(times), 1.0, 6.0, 1200)
     with torch.no_grad():
         tile_plane(field.static, 33, 25, z=4.0, spacing=0.1)
         tile_plane(field.moving, 11, 11, z=2.0, spacing=0.04)
         field.moving.log_radiance[:] = torch.tensor([1.0, 0.0, -1.0])
-        shifts = field.trajectories.translations.view(TIMES, bases, 4)
-        shifts[:, :, :3] = torch.arange(TIMES)[:, None, None] * STEP
+        shifts = field.trajectories.translations.view(times, bases, 4)
+        shifts[:, :, :3] = torch.arange(times)[:, None, None] * STEP
         field.background[:] = math.log(0.3)
     return field
 
@@ -114,6 +114,14 @@ def test_scene_flow_at_the_card_is_its_step() -> None:
 @pytest.mark.parametrize("time", [0.0, 9.0, 8.5, 0.5])
 def test_at_the_ends_of_the_clip_scene_flow_continues_straight(time: float) -> None:
     render = card_field().render(CAMERA, time)
+    at = pixel_of(torch.tensor([0.0, 0, 2]) + time * STEP)
+    torch.testing.assert_close(render.scene_flow[1][at], STEP, atol=1e-3, rtol=0)
+    torch.testing.assert_close(render.scene_flow[-1][at], -STEP, atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("time", [0.0, 0.3, 1.0])
+def test_two_training_times_have_the_scene_flow_from_one_to_the_other(time: float) -> None:
+    render = card_field(times=2).render(CAMERA, time)
     at = pixel_of(torch.tensor([0.0, 0, 2]) + time * STEP)
     torch.testing.assert_close(render.scene_flow[1][at], STEP, atol=1e-3, rtol=0)
     torch.testing.assert_close(render.scene_flow[-1][at], -STEP, atol=1e-3, rtol=0)

@@ -20,6 +20,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from hdr_nsff.core import distributed
+from hdr_nsff.core.checkpoints import latest_checkpoint
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import write_json
 from hdr_nsff.fields.outputs import record_pixels
@@ -297,6 +298,20 @@ def test_nan_names_the_step_and_the_term(toy: Scene, toy_folder: Path, tmp_path:
         FloatingPointError, match=r"step 0: the terms \['photometric'.* are not finite; pixel \["
     ):
         t.step()
+
+
+def test_a_checkpoint_with_nan_is_not_written_and_the_last_one_stays(
+    toy: Scene, toy_folder: Path, tmp_path: Path
+) -> None:
+    t = trainer(config(toy_folder, tmp_path / "run"), toy)
+    t.save()
+    with torch.no_grad():
+        next(t.field.parameters()).view(-1)[0] = math.nan
+    t.clock = replace(t.clock, step=1)
+    with pytest.raises(FloatingPointError, match=r"step 1: field\..* not finite"):
+        t.save()
+    kept = latest_checkpoint(tmp_path / "run")
+    assert kept is not None and kept.step == 0
 
 
 def at(preset: str, step: int, frames: int = 24, budget: Budget | None = None) -> Clock:

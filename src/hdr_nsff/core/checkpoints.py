@@ -49,8 +49,14 @@ def checkpoint_files(folder: Path) -> list[Path]:
 
 
 def write_checkpoint(path: Path, step: int, seconds: float, tensors: dict[str, Tensor]) -> None:
-    """Write one checkpoint file."""
+    """Write one checkpoint file.
+
+    FloatingPointError, and no file, where a number is NaN or infinite.
+    """
     on_cpu = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    wrong = [name for name, tensor in on_cpu.items() if not torch.isfinite(tensor).all()]
+    if wrong:
+        raise FloatingPointError(f"step {step}: {', '.join(wrong)} not finite")
     metadata = {
         "format": FORMAT,
         "step": str(step),

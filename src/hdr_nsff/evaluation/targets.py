@@ -6,6 +6,7 @@ recorded frames.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -118,8 +119,10 @@ def choose_targets(
     advice = "nothing was held out (`prepare --hold-out 8` does that)"
     note = f"{advice}: these numbers are of frames the field was trained on"
     say(note)
-    stride = -(-len(run.scene.train) // MAX_TRAINING_VIEWS)
-    frames = run.scene.train[:: max(1, stride)]
+    stride = max(1, -(-len(run.scene.train) // MAX_TRAINING_VIEWS))
+    while math.gcd(stride, run.scene.manifest.cycle) > 1:  # all exposures, in turn
+        stride += 1
+    frames = run.scene.train[::stride]
     return "training views (not held out)", frame_targets(frames, TRAINED_ON), [note]
 
 
@@ -233,11 +236,12 @@ def truth_target(run: Run, truth: Truth, view: TruthView, folder: Path, scale: f
     if view.bracket not in match:
         problem = f"view {view.name} is of an exposure that the scene does not have"
         raise InputError(f"{folder}: {problem}; prepare it again")
-    known, novel = {}, {}
-    for bracket, rgb in pictures.items():
-        ev = truth.bracket_ev[bracket]
+    known: dict[int, Tensor] = {}
+    novel: dict[float, Tensor] = {}
+    for bracket in sorted(pictures, key=lambda each: each != view.bracket):  # its own first
+        rgb, ev = pictures[bracket], truth.bracket_ev[bracket]
         if bracket in match:
-            known[match[bracket]] = rgb
+            known.setdefault(match[bracket], rgb)
         elif ev is not None:
             novel[ev] = rgb
     moving = moving_mask(run, view, folder, size)

@@ -113,14 +113,15 @@ def flow_duration(time: float, direction: int, times: Sequence[float]) -> float:
     """Over how many frames the scene flow at a time goes later (1) or earlier (-1).
 
     That is one training interval of the `times`. Beyond their ends it continues the
-    flow of the other direction. Infinite where neither is within the clip: no flow.
+    flow of the other direction. Where neither is within the clip, it goes from end to
+    end; infinite for a clip of one time: no flow.
     """
     knots = np.arange(len(times))
     knot = float(np.interp(time, times, knots))
     for side in (direction, -direction):
         if knots[0] <= knot + side <= knots[-1]:
             return abs(float(np.interp(knot + side, knots, times)) - time)
-    return math.inf
+    return times[-1] - times[0] if len(times) > 1 else math.inf
 
 
 def splat(

@@ -98,8 +98,9 @@ def squared_error(render: Render, batch: PixelBatch, tonemapper: ToneMapper) -> 
 
 def spread_frames(count: int, num_frames: int, step: int) -> list[int]:
     """Positions of up to `count` of the frames, evenly spread; others every step."""
+    count = min(count, num_frames)
     offset = step % ROTATION / ROTATION
-    places = [(i + offset) * num_frames / count for i in range(min(count, num_frames))]
+    places = [(i + offset) * num_frames / count for i in range(count)]
     return sorted({int(place) % num_frames for place in places})
 
 

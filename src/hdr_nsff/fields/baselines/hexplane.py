@@ -20,9 +20,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
+from annotated_types import Ge, Le
 from torch import Tensor, nn
 
 from hdr_nsff.core.param_group import ParamGroup
@@ -80,9 +81,9 @@ class HexPlaneConfig:
     """Subtracted from raw density, so that space is empty at the start."""
     width: Advanced[Count] = 128
     """Width of the color network."""
-    samples: Count = 64
+    samples: Annotated[int, Ge(2), Le(10**6)] = 64
     """Samples along a ray while training."""
-    render_samples: Count = 128
+    render_samples: Annotated[int, Ge(2), Le(10**6)] = 128
     """Samples along a ray when rendering."""
     cull_after: Advanced[Number] = 500
     """Steps before samples in cells that never mattered are skipped."""

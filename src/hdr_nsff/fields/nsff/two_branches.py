@@ -19,7 +19,7 @@ from pydantic import Discriminator
 from torch import Tensor, nn
 
 from hdr_nsff.core.param_group import ParamGroup
-from hdr_nsff.core.settings import Advanced, Count, Number, Share, Weight
+from hdr_nsff.core.settings import Advanced, Number, Share, Weight
 from hdr_nsff.core.tensors import generator_for
 from hdr_nsff.fields.base import FrameError
 from hdr_nsff.fields.knots import knot_of
@@ -72,7 +72,7 @@ class BranchesConfig:
     )
     samples: Annotated[int, Ge(2), Le(10**6)] = 32
     """Samples along a ray while training."""
-    render_samples: Count = 64
+    render_samples: Annotated[int, Ge(2), Le(10**6)] = 64
     """Samples along a ray when rendering."""
     compositing: Literal["add", "blend", "superpose"] = "add"
     """How static and dynamic content share a place: densities add up and share the

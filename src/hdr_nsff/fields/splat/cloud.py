@@ -65,10 +65,14 @@ def displacement(model: Model, means: Tensor, living: Living, knot: float, offse
 
     `living` (A) are the time-local ones among them. `offset` is +1 (later) or -1
     (earlier): between two training times, to as far between the next two. Beyond the
-    clip's ends, the displacement of the other direction is continued.
+    clip's ends, the displacement of the other direction is continued. Between the only
+    two training times it is that from one to the other.
     """
     if model.has_knot(knot + offset):
         return positions_at(model, knot + offset, living) - means
     if model.has_knot(knot - offset):
         return means - positions_at(model, knot - offset, living)
-    return torch.zeros_like(means)
+    if model.last_knot == 0:
+        return torch.zeros_like(means)
+    first, last = (positions_at(model, end, living) for end in (0, model.last_knot))
+    return offset * (last - first)
