@@ -13,14 +13,14 @@ import hashlib
 import json
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Any
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.hashes import hash_file
-from hdr_nsff.core.io import SCENE_FILE, is_leftover
+from hdr_nsff.core.io import SCENE_FILE, atomic, is_leftover
 from hdr_nsff.core.process import cpu_seconds, peak_memory
 from hdr_nsff.core.progress import say
 from hdr_nsff.footage.datasets.capture import Picture
@@ -29,6 +29,8 @@ from hdr_nsff.prepare.result import StepResult, store
 from hdr_nsff.prepare.steps.neural import weights_of
 from hdr_nsff.prepare.work import PrepareConfig, StepName, Work
 from hdr_nsff.scene.manifest import Manifest, Split, StepRecord
+
+ASIDE = ".aside"  # earlier outputs of the step that starts over
 
 
 @dataclass(frozen=True)
@@ -59,9 +61,9 @@ def run_step(work: Work, name: StepName, step: Step) -> None:
     if begun is not None and begun.done and step.complete(work.manifest) and present(work, step):
         return
     step.check(work)
+    earlier = (work.folder / SCENE_FILE).read_bytes() if before and begun is None else None
     if begun is None:
-        for output in step.outputs:
-            remove(work.folder / output)
+        set_aside(work.folder, step.outputs)
     record = begun or next_attempt(before, key)
     records[name] = record.model_copy(update={"done": False})
     work.save()
@@ -69,7 +71,10 @@ def run_step(work: Work, name: StepName, step: Step) -> None:
     try:
         result = step.run(work)
     except InputError:
-        leave_nothing(work, step)
+        if earlier is not None:
+            bring_back(work.folder, step.outputs, earlier)
+        else:
+            leave_nothing(work, step)
         raise
     store(work.folder, work.manifest, result)
     records[name] = StepRecord(
@@ -83,9 +88,31 @@ def run_step(work: Work, name: StepName, step: Step) -> None:
         details={**record.details, **result.details},
     )
     work.save()
+    remove(work.folder / ASIDE)
     work.forget(step.forgets)
     if not step.quiet:
         say(f"{name}: {result.note}")
+
+
+def set_aside(folder: Path, outputs: Sequence[str]) -> None:
+    """Move the `outputs` of a step that starts over aside, until it has succeeded."""
+    aside = folder / ASIDE
+    remove(aside)
+    for output in outputs:
+        if (folder / output).exists():
+            aside.mkdir(exist_ok=True)
+            (folder / output).rename(aside / output)
+
+
+def bring_back(folder: Path, outputs: Sequence[str], manifest: bytes) -> None:
+    """Undo a refused step: its earlier `outputs`, and the `manifest` as it was."""
+    for output in outputs:
+        remove(folder / output)
+        if (folder / ASIDE / output).exists():
+            (folder / ASIDE / output).rename(folder / output)
+    with atomic(folder / SCENE_FILE) as temporary:
+        temporary.write_bytes(manifest)
+    remove(folder / ASIDE)
 
 
 def leave_nothing(work: Work, step: Step) -> None:
