@@ -320,24 +320,16 @@ def test_a_video_is_cut_short_before_a_frame_that_is_held_long(tmp_path, suffix,
 def write_dng(
     path: Path, level: float, seconds: tuple[int, int] | None = None, green: float = 1.0
 ) -> None:
-    """A small raw photograph of a gray card, its upper half at half `level` of the
-    sensor's range; with its exposure time, and a white balance as shot.
+    """A small raw photograph of a gray card in daylight, its upper half at half `level`
+    of the sensor's range; with its exposure time, and a white balance as shot.
     """
     tifffile = pytest.importorskip("tifffile")
-    raw = np.full((64, 96), int(level * 65535), np.uint16)
-    raw[:32] //= 2
-    # XYZ to the camera's own colors
-    matrix = (
-        3.1339,
-        -1.6169,
-        -0.4906,
-        -0.9785,
-        1.9160,
-        0.0333,
-        0.0720,
-        -0.2290,
-        1.4057,
-    )
+    # XYZ to the camera's own colors; LibRaw's gain of green is not 1
+    matrix = (1.0405, -0.3755, -0.1270, -0.5461, 1.3787, 0.1793, -0.1040, 0.2015, 0.6785)
+    gray = np.reshape(matrix, (3, 3)) @ (0.9505, 1, 1.089)
+    r, g, b = gray / gray.max()
+    raw = np.tile([[r, g], [g, b]], (32, 48)) * level * 65535
+    raw[:32] /= 2
 
     def ratios(values: tuple[float, ...]) -> tuple[int, ...]:
         return tuple(n for v in values for n in (round(v * 10000), 10000))
@@ -354,7 +346,7 @@ def write_dng(
     ]
     if seconds is not None:
         tags += [(33434, "2I", 1, seconds), (34855, "H", 1, 400), (33437, "2I", 1, (28, 10))]
-    tifffile.imwrite(path, raw, photometric=32803, extratags=[(*t, True) for t in tags])
+    tifffile.imwrite(path, np.uint16(raw), photometric=32803, extratags=[(*t, True) for t in tags])
 
 
 def test_raw_photographs_are_linear_and_share_a_white_balance(tmp_path):
@@ -365,6 +357,13 @@ def test_raw_photographs_are_linear_and_share_a_white_balance(tmp_path):
     assert np.allclose(bright / dark, 4, rtol=0.01)
     half = all_frames(tmp_path)[1].rgb[16, 48] ** 2.2
     assert np.allclose(bright / half, 2, rtol=0.01)
+
+
+def test_a_gray_card_in_daylight_is_gray_in_a_raw_photograph(tmp_path):
+    pytest.importorskip("rawpy")
+    write_dng(tmp_path / "a.dng", 0.4)
+    card = read_frame(tmp_path / "a.dng")[40:56, 8:-8]
+    assert np.allclose(card, 0.4, atol=0.001)
 
 
 def test_raw_photographs_are_scaled_by_white_and_not_by_their_brightest_pixel(tmp_path):

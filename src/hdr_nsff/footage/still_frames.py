@@ -64,8 +64,17 @@ def read_dng(path: Path) -> np.ndarray:
                 no_auto_bright=True,
                 output_bps=16,
                 adjust_maximum_thr=0.0,  # white is the sensor's, not the frame's brightest
-                user_wb=[float(v) or 1.0 for v in raw.daylight_whitebalance],
+                user_wb=daylight_gains(raw.daylight_whitebalance),
             )
     except rawpy.LibRawError as error:
         raise InputError(f"{path}: not a readable DNG ({error!s}); copy it again") from error
     return image.astype(np.float32) / np.float32(65535)
+
+
+def daylight_gains(gains: list[float]) -> list[float]:
+    """LibRaw's gains of red, green, blue and the second green, none of them 0. It gives
+    0 where it knows none, and for a second green that is as the first.
+    """
+    red, green, blue, second = gains
+    green = green or 1.0
+    return [red or 1.0, green, blue or 1.0, second or green]
