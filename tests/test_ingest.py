@@ -108,6 +108,12 @@ def test_a_folder_of_videos_is_a_rig(tmp_path):
     assert np.allclose([f.rgb.mean() for f in frames], [0.3, 0.3, 0.6, 0.6], atol=0.03)
 
 
+def test_stills_in_a_folder_beside_videos_are_no_footage(tmp_path):
+    write_video(tmp_path / "a.mp4", [picture(0.5)] * 4, fps=12)
+    folder_of(tmp_path / "thumbnails", [0.5] * 5)
+    assert open_footage(tmp_path).cameras == [[tmp_path / "a.mp4"]]
+
+
 @pytest.mark.parametrize(("frames", "fps"), [(5, 12), (4, 24)])
 def test_videos_of_a_rig_need_one_length_and_one_rate(tmp_path, frames, fps):
     write_video(tmp_path / "a.mp4", [picture(0.5)] * 4, fps=12)

@@ -130,10 +130,12 @@ def open_footage(clip: Path) -> Footage:
         raise InputError(f"{clip}: no such file or folder; give {ACCEPTED}")
     cameras = [frame_files(clip)]
     if not cameras[0]:
+        if video_files(clip):
+            return open_videos(clip)
         cameras = [frame_files(f) for f in sorted_folders(clip) if not (f / SCENE_FILE).exists()]
         cameras = [files for files in cameras if files]
     if not cameras:
-        return open_videos(clip)
+        raise InputError(f"{clip}: no frames and no videos in this folder; give {ACCEPTED}")
     first = cameras[0]
     for files in cameras[1:]:
         if len(files) != len(first):
@@ -165,12 +167,9 @@ def open_video(clip: Path) -> Footage:
 def open_videos(folder: Path) -> Footage:
     """The footage of a folder of videos, one per synchronized camera.
 
-    InputError without videos, and where they differ in length, rate or transfer
-    function.
+    InputError where they differ in length, rate or transfer function.
     """
     files = video_files(folder)
-    if not files:
-        raise InputError(f"{folder}: no frames and no videos in this folder; give {ACCEPTED}")
     first, *others = (open_video(file) for file in files)
     for other in others:
         names = f"{other.path}: {first.path.name} and this video"
