@@ -80,6 +80,49 @@ def test_images_that_are_missing_cut_short_or_damaged_are_refused(tmp_path: Path
         read_image(tmp_path / "a.tif")
 
 
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("bigtiff", [False, True])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("alpha", [[], ["unassalpha"]])
+def test_colors_of_a_tiff_are_read_as_stored(
+    alpha: list[str], dtype: type, bigtiff: bool, order: str, tmp_path: Path
+) -> None:
+    """OpenCV alone would multiply those of 8 bits by their alpha."""
+    tifffile = pytest.importorskip("tifffile")
+    top = np.iinfo(dtype).max
+    codes = np.random.default_rng(0).integers(0, top, (5, 7, 3 + len(alpha)), dtype)
+    options = {"bigtiff": bigtiff, "byteorder": order, "extrasamples": alpha}
+    tifffile.imwrite(tmp_path / "a.tif", codes, photometric="rgb", **options)
+    assert np.allclose(read_image(tmp_path / "a.tif"), codes[..., :3] / top)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize(
+    ("shape", "kind", "what"),
+    [
+        ((3, 5, 7), {"photometric": "rgb", "planarconfig": "separate"}, "one plane per channel"),
+        ((5, 7), {"photometric": "miniswhite"}, "white is 0"),
+        ((5, 7, 2), {"photometric": "minisblack", "planarconfig": "contig"}, "further channels"),
+    ],
+)
+def test_a_tiff_of_16_bits_that_would_be_decoded_wrongly_is_refused(
+    shape: tuple[int, ...], kind: dict[str, str], what: str, order: str, tmp_path: Path
+) -> None:
+    tifffile = pytest.importorskip("tifffile")
+    tifffile.imwrite(tmp_path / "a.tif", np.ones(shape, np.uint16), byteorder=order, **kind)
+    with pytest.raises(InputError, match=rf"a\.tif: .*{what}.*; save it"):
+        read_image(tmp_path / "a.tif")
+
+
+def test_a_tiff_of_8_bits_may_have_planes_or_white_as_0(tmp_path: Path) -> None:
+    tifffile = pytest.importorskip("tifffile")
+    codes = np.random.default_rng(0).integers(0, 255, (3, 5, 7), np.uint8)
+    tifffile.imwrite(tmp_path / "a.tif", codes, photometric="rgb", planarconfig="separate")
+    assert np.allclose(read_image(tmp_path / "a.tif"), np.moveaxis(codes, 0, -1) / 255)
+    tifffile.imwrite(tmp_path / "a.tif", codes[0], photometric="miniswhite")
+    assert np.allclose(read_image(tmp_path / "a.tif")[..., 0], 1 - codes[0] / 255)
+
+
 @pytest.mark.parametrize("progressive", [False, True])
 def test_what_follows_the_end_of_a_jpeg_is_no_damage(progressive: bool, tmp_path: Path) -> None:
     """Phones append data of their own, and motion photos a video."""

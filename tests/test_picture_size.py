@@ -56,7 +56,12 @@ def test_all_kinds_of_tiff(order: str, bigtiff: bool) -> None:
     assert encoded_size(file.getvalue()) == (300, 200)
 
 
-@pytest.mark.parametrize("data", [b"", b"\x89PNG\r\n\x1a\n", b"\xff\xd8", b"II*\0", b"text"])
+NOWHERE = b"II+\0\x08\0\0\0" + b"\xff" * 8  # a BigTIFF whose directory is beyond all files
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"\x89PNG\r\n\x1a\n", b"\xff\xd8", b"II*\0", NOWHERE, b"text"]
+)
 def test_no_header_has_no_size(data: bytes) -> None:
     assert encoded_size(data) is None
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from hdr_nsff.core import tiff
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import atomic, how_to_restore
 from hdr_nsff.core.picture_size import check_size, encoded_size
@@ -98,6 +99,8 @@ def decode(path: Path, transparency: bool) -> np.ndarray:
     size = encoded_size(data)
     if size is not None:
         check_size(path, *size)
+    if size is not None and data[:4] in tiff.STARTS:
+        data = tiff.decodable_tiff(path, data)
     opaque = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH
     flags = cv2.IMREAD_UNCHANGED if transparency else opaque
     try:

@@ -9,15 +9,12 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
+from hdr_nsff.core import tiff
 from hdr_nsff.core.errors import InputError
 
 # above the largest sensors (150 megapixels); takes 2.4 GB as single-precision rgb
 MAX_MEGAPIXELS = 200
 JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # markers SOF0 to SOF15
-TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # TIFF and BigTIFF
-TIFF_WIDTH = 256  # tags of TIFF 6.0
-TIFF_HEIGHT = 257
-TIFF_INTEGERS = {3: "H", 4: "I", 16: "Q"}  # field types
 
 
 def check_size(path: Path | str, width: int, height: int) -> None:
@@ -39,11 +36,11 @@ def encoded_size(data: bytes) -> tuple[int, int] | None:
             return width, height
         if data.startswith(b"\xff\xd8"):
             return jpeg_size(data)
-        if data[:4] in TIFF_STARTS:
+        if data[:4] in tiff.STARTS:
             return tiff_size(data)
         if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
             return webp_size(data)
-    except (struct.error, IndexError):  # it ends before its size
+    except (struct.error, IndexError, OverflowError):  # it ends before its size
         return None
     return None
 
@@ -67,29 +64,10 @@ def jpeg_size(data: bytes) -> tuple[int, int]:
 
 def tiff_size(data: bytes) -> tuple[int, int]:
     """The size in the first directory of a TIFF; IndexError without one."""
-    order = "<" if data[:2] == b"II" else ">"
-    if b"+" in data[:4]:  # BigTIFF
-        (place,) = struct.unpack_from(f"{order}Q", data, 8)
-        (count,) = struct.unpack_from(f"{order}Q", data, place)
-        first = place + 8
-        entry_bytes = 20
-        value_bytes = 8
-    else:
-        (place,) = struct.unpack_from(f"{order}I", data, 4)
-        (count,) = struct.unpack_from(f"{order}H", data, place)
-        first = place + 2
-        entry_bytes = 12
-        value_bytes = 4
-    value_offset = entry_bytes - value_bytes  # the value ends an entry
-    found = {}
-    for start in range(first, first + count * entry_bytes, entry_bytes):
-        tag, kind = struct.unpack_from(f"{order}HH", data, start)
-        if tag in (TIFF_WIDTH, TIFF_HEIGHT) and kind in TIFF_INTEGERS:
-            value = struct.unpack_from(order + TIFF_INTEGERS[kind], data, start + value_offset)
-            found[tag] = value[0]
-    if len(found) < 2:
+    tags = tiff.tiff_tags(data)
+    if tiff.WIDTH not in tags or tiff.HEIGHT not in tags:
         raise IndexError("no size in the first directory")
-    return found[TIFF_WIDTH], found[TIFF_HEIGHT]
+    return tags[tiff.WIDTH][0], tags[tiff.HEIGHT][0]
 
 
 def webp_size(data: bytes) -> tuple[int, int]:
