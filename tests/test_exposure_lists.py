@@ -77,6 +77,15 @@ def test_a_csv_beside_a_video_names_frames_by_number(tmp_path):
     assert read_exposure_csv(open_footage(tmp_path / "clip.mp4"))[1] == {"#0": -3, "#1": 1.5}
 
 
+def test_numbers_of_frames_may_have_leading_zeros(tmp_path):
+    write_frames(tmp_path, 2)
+    text = "frame,ev,timestamp_ns\n0000,-3,5e9\n0001,1.5,6e9\n"
+    (tmp_path / "exposures.csv").write_text(text)
+    footage = open_footage(tmp_path)
+    assert read_exposure_csv(footage)[1] == {"#0": -3, "#1": 1.5}
+    assert read_timestamps(footage) == {"#0": 5, "#1": 6}
+
+
 @pytest.mark.parametrize(
     ("text", "what"),
     [

@@ -115,9 +115,7 @@ def read_listed(footage: Footage) -> tuple[Path, dict[str, Listed]] | None:
         for row in reader:
             where = f"{path}, line {reader.line_num}"
             check_cells(row, (name, *values), where)
-            key = row[name].strip()
-            if name == "frame":
-                key = f"#{key}"
+            key = frame_key(name, row[name])
             ev = sum(ev_of_cell(column, row[column], where) for column in values)
             if abs(ev) > MAX_EV:
                 raise InputError(
@@ -220,6 +218,16 @@ def ev_of_cell(column: str, text: str, where: str) -> float:
     if column == "iso":
         return math.log2(value / 100)
     return -2 * math.log2(value)  # f-number
+
+
+def frame_key(column: str, text: str) -> str:
+    """What names a frame, of a cell in the column `file` or `frame`: its file name, or
+    `#number` without leading zeros.
+    """
+    text = text.strip()
+    if column == "file":
+        return text
+    return f"#{text.lstrip('0') or '0'}" if text.isdecimal() else f"#{text}"
 
 
 def seconds_of_cell(column: str, text: str, where: str) -> float | None:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.footage.exposure_lists import find_csv, parse_number, read_utf8
+from hdr_nsff.footage.exposure_lists import find_csv, frame_key, parse_number, read_utf8
 from hdr_nsff.footage.footage import Footage
 
 COLUMN = "timestamp_ns"
@@ -40,9 +40,7 @@ def read_timestamps(footage: Footage) -> dict[str, float]:
             return {}
         for row in reader:
             where = f"{path}, line {reader.line_num}"
-            key = (row[name] or "").strip()
-            if name == "frame":
-                key = f"#{key}"
+            key = frame_key(name, row[name] or "")
             seconds[key] = 1e-9 * parse_number(row[COLUMN] or "", where)
     except csv.Error as error:
         line = reader.line_num + 1
