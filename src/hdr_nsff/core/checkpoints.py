@@ -78,8 +78,8 @@ def checksum(step: int, seconds: float, tensors: dict[str, Tensor]) -> str:
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
-    """Read one checkpoint file. InputError where it is cut short or from another
-    version.
+    """Read one checkpoint file. InputError where it is cut short, from another version,
+    or holds NaN or Inf.
     """
     if not Path(path).is_file():  # a pipe would be waited for
         raise InputError(f"{path}: missing, or no ordinary file; restore it")
@@ -95,7 +95,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
         if metadata["checksum"] != checksum(step, seconds, tensors):
             raise ValueError("other bytes than were written")
         if not all(torch.isfinite(tensor).all() for tensor in tensors.values()):
-            raise ValueError("NaN or Inf")
+            raise InputError(f"{path}: the checkpoint holds NaN or Inf")
         return Checkpoint(step, seconds, tensors)
     except InputError:
         raise
