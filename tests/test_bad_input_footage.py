@@ -291,6 +291,7 @@ def test_masks_and_depth_that_do_not_fit_are_found_before_flow(
     for i in range(FRAMES):
         write_png(wide / f"{i}.png", np.zeros((34, 61), bool))
         write_png(tmp_path / f"named/{i // 2:03d}.png", np.zeros((34, 60), bool))
+        write_text(tmp_path / f"named/._{i // 2:03d}.png", "")  # as macOS leaves them
         write_npy(tmp_path / f"tall/{i}.npy", np.ones((35, 60), np.float32))
         write_npy(tmp_path / f"empty/{i}.npy", np.full((34, 60), i - 8.0, np.float32))
     named = f"{tmp_path / 'named'}: 5 maps for 9 frames, none for 005.png;"

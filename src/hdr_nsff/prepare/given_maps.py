@@ -69,7 +69,7 @@ def given_files(work: Work, option: str, folder: Path, suffixes: set[str]) -> li
         path
         for each in folders
         for path in sorted(each.iterdir(), key=natural_key)
-        if path.suffix.lower() in suffixes
+        if path.suffix.lower() in suffixes and not path.name.startswith(".")
     ]
     count = len(work.manifest.frames)
     rows: Sequence[int] = range(count)
