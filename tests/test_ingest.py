@@ -60,6 +60,22 @@ def test_only_decimal_digits_are_numbers_in_names(tmp_path):
     assert [f.source for f in all_frames(tmp_path)] == ["0.png", "1²2.png", "1²10.png"]
 
 
+@pytest.mark.parametrize("name", ["render.", "render_"])
+def test_numbers_of_frames_may_be_negative(name, tmp_path):
+    for number in (-10, -2, 0, 3):
+        write_png(tmp_path / f"{name}{number}.png", picture(0.5))
+    expected = [f"{name}{number}.png" for number in (-10, -2, 0, 3)]
+    assert [f.source for f in all_frames(tmp_path)] == expected
+
+
+@pytest.mark.parametrize("name", ["a-", "-", "2020-01-"])
+def test_a_minus_that_separates_a_number_is_no_sign(name, tmp_path):
+    for number in (1, 2, 10):
+        write_png(tmp_path / f"{name}{number}.png", picture(0.5))
+    expected = [f"{name}{number}.png" for number in (1, 2, 10)]
+    assert [f.source for f in all_frames(tmp_path)] == expected
+
+
 def test_range_and_stride_choose_frames_by_their_number(tmp_path):
     folder_of(tmp_path, [0.5] * 10)
     assert [f.number for f in all_frames(tmp_path, start=2, end=9, stride=3)] == [2, 5, 8]

@@ -13,18 +13,22 @@ CHECK_PICTURE = "_check.png"  # ends the name of what `check` writes, which is n
 VIDEOS = {".mp4", ".mov", ".mkv", ".m4v", ".avi", ".webm", ".mxf", ".mts"}
 # a name that is a time, whose last zeros may be missing
 SECONDS = re.compile(r"\d{9,}\.\d+", re.ASCII)
+# a number in a name; after a dot or an underscore, a minus is no separator but its sign
+NUMBER = re.compile(r"((?:(?<=[._])-)?\d+)")
 DECIMALS = 30  # more than names of times have
 
 
 def natural_key(path: Path) -> list[tuple[int, int, str]]:
-    """A key that sorts frame2 before frame10, and seconds since 1970 as decimals."""
+    """A key that sorts frame2 before frame10, frame.-2 before frame.-1, and seconds
+    since 1970 as decimals.
+    """
     name = path.name
     if SECONDS.fullmatch(path.stem):
         whole, fraction = path.stem.split(".")
         name = f"{whole}.{fraction.ljust(DECIMALS, '0')}{path.suffix}"
     key = []
-    for part in re.split(r"(\d+)", name):
-        if part.isdecimal():  # not `isdigit`: ² is a digit, and no number
+    for part in NUMBER.split(name):
+        if part.removeprefix("-").isdecimal():  # not `isdigit`: ² is a digit, and no number
             key.append((0, int(part), ""))
         elif part:
             key.append((1, 0, part.lower()))
