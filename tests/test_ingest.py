@@ -9,6 +9,7 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
+import OpenEXR
 import pytest
 from mutations import check_reader
 from PIL import Image
@@ -246,6 +247,35 @@ def test_raw_frames_are_not_read_for_a_scale(monkeypatch):
     """They are never brighter than 1; reading one takes seconds."""
     monkeypatch.setattr(linear_light, "read_frame", lambda path: pytest.fail(f"{path} is read"))
     assert linear_light.linear_scale([Path("a.dng"), Path("b.DNG")]) == 1
+
+
+def test_only_the_colors_of_a_linear_frame_have_to_be_finite(tmp_path):
+    light, depth = picture(0.5), np.full((24, 32), np.inf, np.float32)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, {"RGB": light, "Z": depth}) as file:
+        file.write(str(tmp_path / "a.exr"))
+    assert np.array_equal(read_frame(tmp_path / "a.exr"), light)
+    with OpenEXR.File(header, {"RGB": light * np.float32(np.inf), "Z": depth}) as file:
+        file.write(str(tmp_path / "a.exr"))
+    with pytest.raises(InputError, match="channel RGB holds NaN or Inf"):
+        read_frame(tmp_path / "a.exr")
+
+
+@pytest.mark.parametrize("channel", ["RGB", "Y"])
+def test_radiance_below_zero_is_refused_in_color_and_gray(channel, tmp_path):
+    light = picture(0.5) - 0.4
+    write_exr(tmp_path / "a.exr", {channel: light if channel == "RGB" else light[..., 0]})
+    with pytest.raises(InputError, match=r"a\.exr: negative radiance"):
+        read_frame(tmp_path / "a.exr")
+
+
+def test_linear_frames_need_one_data_window(tmp_path):
+    for i in range(3):
+        window = (np.array([0, i // 2], np.int32), np.array([31, 23 + i // 2], np.int32))
+        write_exr(tmp_path / f"{i}.exr", {"RGB": picture(0.5)}, {"dataWindow": window})
+    with pytest.raises(InputError, match=r"2\.exr: .* begins at \(0, 1\), that of 0\.exr"):
+        all_frames(tmp_path)
+    assert len(all_frames(tmp_path, end=2)) == 2
 
 
 def test_shrinking_averages_and_keeps_the_shape():

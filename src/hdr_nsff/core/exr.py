@@ -6,7 +6,7 @@ Reading checks and refuses in one sentence (`InputError`); writing never clamps.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, redirect_stdout
 from io import StringIO
 from pathlib import Path
@@ -81,17 +81,42 @@ def quiet() -> Iterator[None]:
             os.close(stderr)
 
 
-def read_exr(path: Path | str) -> dict[str, np.ndarray]:
+@contextmanager
+def refusing(path: Path) -> Iterator[None]:
+    """Errors of OpenEXR as InputError."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:  # OpenEXR raises several unrelated types
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        raise InputError(f"{path}: not a readable EXR ({reason}); copy it again") from error
+
+
+def read_header(path: Path) -> dict[str, Any]:
+    """The attributes of an EXR."""
+    with quiet(), OpenEXR.File(str(path), header_only=True) as file:
+        return dict(file.header())
+
+
+def read_origin(path: Path) -> tuple[int, int]:
+    """Left and top of the data window of an EXR."""
+    with refusing(path):
+        (left, top), _ = read_header(path)["dataWindow"]
+        return int(left), int(top)
+
+
+def read_exr(path: Path | str, used: Collection[str] | None = None) -> dict[str, np.ndarray]:
     """Channels of an EXR as float32: {"RGB": (H, W, 3)}, {name: (H, W)} for the others.
 
-    InputError for a file cut short, NaN or Inf, and pixels that are not square.
+    InputError for a file cut short, pixels that are not square, and NaN or Inf, looked
+    for in the channels that are `used`, by default all.
     """
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file; put it back or correct the name")
-    try:
-        with quiet(), OpenEXR.File(str(path), header_only=True) as file:
-            header = dict(file.header())
+    with refusing(path):
+        header = read_header(path)
         if (aspect := header.get("pixelAspectRatio", 1.0)) != 1:
             raise InputError(f"{path}: pixels {aspect:g} times as wide as high; write square ones")
         (left, top), (right, bottom) = header["dataWindow"]
@@ -100,15 +125,10 @@ def read_exr(path: Path | str) -> dict[str, np.ndarray]:
             if not file.parts:
                 raise InputError(f"{path}: the EXR is cut short or damaged; copy it again")
             channels = {n: np.array(c.pixels, dtype=np.float32) for n, c in file.channels().items()}
-    except InputError:
-        raise
-    except Exception as error:  # OpenEXR raises several unrelated types
-        reason = str(error).partition("\n")[0] or type(error).__name__
-        raise InputError(f"{path}: not a readable EXR ({reason}); copy it again") from error
     if "RGB" not in channels and "RGBA" in channels:
         channels["RGB"] = np.ascontiguousarray(channels["RGBA"][..., :3])
     for name, array in channels.items():
-        if not np.isfinite(array).all():
+        if (used is None or name in used) and not np.isfinite(array).all():
             advice = "correct it in the program that wrote it"
             raise InputError(f"{path}: channel {name} holds NaN or Inf; {advice}")
     return channels

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.exr import read_origin
 from hdr_nsff.core.video import VideoInfo, frame_spans, read_video, video_info
 from hdr_nsff.footage.footage import TRANSFERS, Footage
 from hdr_nsff.footage.linear_light import encode_light, encode_signal, linear_scale
@@ -55,6 +56,8 @@ def read_frames(
     chosen = range(start, stop, stride)
     scale = 1.0
     if footage.linear:
+        for files in footage.cameras:
+            check_origins(files[start:end:stride])
         scale = linear_scale([f for files in footage.cameras for f in files[start:end:stride]])
     first: tuple[str, int, int] | None = None  # name, height, width
     for line, files in enumerate(footage.cameras):
@@ -85,6 +88,20 @@ def brightest(image: np.ndarray) -> tuple[float, int]:
     top = image.max()
     clipped = (image == top).any(-1).sum() if float(top) in NARROW_BITS else 0
     return float(top), int(clipped)
+
+
+def check_origins(files: list[Path]) -> None:
+    """InputError where the data window moves between EXR frames of a camera, whose
+    pixels would be compared at the wrong places.
+    """
+    pictures = [path for path in files if path.suffix.lower() == ".exr"]
+    origins = [read_origin(path) for path in pictures]
+    for path, origin in zip(pictures, origins, strict=True):
+        if origin != origins[0]:
+            raise InputError(
+                f"{path}: the data window begins at {origin}, that of {pictures[0].name} at "
+                f"{origins[0]}; write all frames with one data window"
+            )
 
 
 def check_range(files: list[Path], tops: list[tuple[float, int]]) -> None:

@@ -29,20 +29,17 @@ def read_frame(path: Path, over: float | None = None) -> np.ndarray:
 
 def read_linear_exr(path: Path) -> np.ndarray:
     """Linear radiance (H, W, 3) of an EXR, gray or rgb; InputError below zero."""
-    channels = read_exr(path)
-    if "RGB" not in channels:
-        if "Y" not in channels:
-            found = shorten(", ".join(channels))
-            raise InputError(
-                f"{path}: no R, G, B channels (found {found}); write the picture as RGB"
-            )
-        return np.repeat(channels["Y"][..., None], 3, -1)
-    if channels["RGB"].min() < 0:
+    channels = read_exr(path, ("RGB", "Y"))
+    light = channels.get("RGB", channels.get("Y"))
+    if light is None:
+        found = shorten(", ".join(channels))
+        raise InputError(f"{path}: no R, G, B channels (found {found}); write the picture as RGB")
+    if light.min() < 0:
         raise InputError(
             f"{path}: negative radiance; clip at zero or subtract the black level before "
             "writing the EXR"
         )
-    return channels["RGB"]
+    return light if light.ndim == 3 else np.repeat(light[..., None], 3, -1)
 
 
 def read_dng(path: Path) -> np.ndarray:
