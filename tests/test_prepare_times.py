@@ -7,6 +7,7 @@ import av
 import numpy as np
 import pytest
 from test_exposure_cycle import clip
+from test_ingest import write_held_video
 from test_prepare_footage import work_on
 
 from hdr_nsff.footage.footage import open_footage
@@ -131,3 +132,14 @@ def test_a_gap_in_the_clock_of_a_video_is_a_gap(tmp_path: Path) -> None:
     work = Work(config, open_footage(path), manifest)
     assert frames_step(work).details == {"missing": 1}
     assert times(work) == WITH_GAP
+    assert manifest.fps == pytest.approx(25) and manifest.frame_seconds == pytest.approx(0.04)
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_a_frame_that_is_held_long_does_not_change_the_rate(tmp_path: Path, stride: int) -> None:
+    path = write_held_video(tmp_path / "clip.mp4")
+    manifest = Manifest(source="clip", width=1, height=1)
+    config = PrepareConfig(path, tmp_path / "scene", stride=stride)
+    frames_step(Work(config, open_footage(path), manifest))
+    assert manifest.fps == pytest.approx(30 / stride)
+    assert manifest.frame_seconds == pytest.approx(1 / 30)

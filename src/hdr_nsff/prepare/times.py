@@ -6,6 +6,7 @@ import numpy as np
 
 from hdr_nsff.core.progress import say
 from hdr_nsff.footage.exposure_lists import row_of
+from hdr_nsff.footage.footage import MAX_RATE_DIFFERENCE
 from hdr_nsff.footage.timestamps import (
     frame_gaps,
     read_timestamps,
@@ -52,18 +53,42 @@ def leave_gaps(work: Work, entries: list[FrameEntry], seconds: list[float | None
     return round(float((first - 1).sum() * stride))
 
 
-def frame_seconds(work: Work, entries: list[FrameEntry]) -> float | None:
-    """Seconds from one frame of the footage to the next, by timestamps or the rate of a
-    video; None where nothing shows them.
+def frame_seconds(
+    work: Work, entries: list[FrameEntry], seconds: list[float | None]
+) -> float | None:
+    """Seconds from one frame of the footage to the next, by timestamps or the clock of
+    a video; None where nothing shows them. `seconds` as of `leave_gaps`.
     """
     if work.capture is not None:
         return None
+    stride = work.config.stride
     written = read_timestamps(work.footage)
     if written:
-        first = [e for e in entries if (e.camera_id, e.track) == (0, 0)]
-        seconds = [seconds_of(work, entry, written) for entry in first]
-        return usual_gap(seconds, work.config.stride)
-    return 1 / work.footage.fps if work.footage.video else None
+        known = [seconds_of(work, entries[k], written) for k in first_line(entries)]
+        return usual_gap(known, stride)
+    if not work.footage.video:
+        return None
+    return usual_gap([seconds[k] for k in first_line(entries)], stride) or 1 / work.footage.fps
+
+
+def frame_rate(work: Work, entries: list[FrameEntry], seconds: list[float | None]) -> float:
+    """Frames as used a second. `seconds` as of `leave_gaps`.
+
+    The rate in the header of a video is an average, to which gaps and held frames
+    count. Its clock corrects it, unless the rate varies as a whole.
+    """
+    stride, rate = work.config.stride, work.footage.fps
+    own = [seconds[k] for k in first_line(entries)]
+    usual = usual_gap(own, stride)
+    if usual is None or frame_gaps(own, stride) is None:
+        return rate / stride
+    agrees = abs(rate * usual - 1) <= MAX_RATE_DIFFERENCE  # times are rounded
+    return (rate if agrees else 1 / usual) / stride
+
+
+def first_line(entries: list[FrameEntry]) -> list[int]:
+    """The places of the frames of the first camera, or its first track."""
+    return [k for k, e in enumerate(entries) if (e.camera_id, e.track) == (0, 0)]
 
 
 def seconds_of(work: Work, entry: FrameEntry, written: dict[str, float]) -> float | None:

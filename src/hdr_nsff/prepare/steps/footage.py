@@ -22,7 +22,7 @@ from hdr_nsff.prepare.exposures import frame_exposures
 from hdr_nsff.prepare.length import offered_segments
 from hdr_nsff.prepare.lens import describe, undistorted
 from hdr_nsff.prepare.result import StepResult
-from hdr_nsff.prepare.times import frame_seconds, leave_gaps, times_of_slots
+from hdr_nsff.prepare.times import frame_rate, frame_seconds, leave_gaps, times_of_slots
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.radiometry import exposure_cycle as exposure
 from hdr_nsff.scene.manifest import FrameEntry, Protocol, bracket_problem
@@ -66,9 +66,9 @@ def frames_step(work: Work) -> StepResult:
     check_frames(c.clip, entries, extents)
     if work.footage.video:
         check_lengths(c.clip, entries)
-    m.frame_seconds = frame_seconds(work, entries)
+    m.frame_seconds = frame_seconds(work, entries, seconds)
+    m.fps = frame_rate(work, entries, seconds)
     missing = leave_gaps(work, entries, seconds)
-    m.fps = work.footage.fps / c.stride
     m.stride = c.stride
     with_time = work.capture is not None  # of other footage, it may have gaps by the cycle
     if [identity(f, with_time) for f in m.frames] != [identity(f, with_time) for f in entries]:
