@@ -10,6 +10,7 @@ from test_exposure_cycle import clip
 from test_ingest import write_held_video
 from test_prepare_footage import work_on
 
+from hdr_nsff.core.images import write_png
 from hdr_nsff.footage.footage import open_footage
 from hdr_nsff.prepare.prepare import PrepareConfig
 from hdr_nsff.prepare.steps.footage import exposure_step, frames_step
@@ -113,6 +114,44 @@ def test_timestamps_of_a_csv_decide_where_the_cycle_shows_less(tmp_path: Path) -
     exposure_step(work)
     assert times(work) == kept.astype(float).tolist()
     assert brackets(work) == (kept % 3).tolist()
+
+
+def stamped(folder: Path, kept: dict[str, np.ndarray], **settings: object) -> Work:
+    """The footage of cameras, by the names of their folders ("": of one), that `kept`
+    these frames, with timestamps and no true exposures; decoded.
+    """
+    lines = ["file,ev,timestamp_ns"]
+    for name, numbers in kept.items():
+        for k, t in enumerate(numbers.tolist()):
+            write_png(folder / "clip" / name / f"{k:03d}.png", clip(EVS, frames=t + 1)[t])
+            lines.append(f"{(Path(name) / f'{k:03d}.png').as_posix()},0,{t * 4e7:.0f}")
+    (folder / "clip/exposures.csv").write_text("\n".join(lines))
+    config = PrepareConfig(folder / "clip", folder / "scene", **settings)
+    work = Work(config, open_footage(config.clip), Manifest(source="clip", width=1, height=1))
+    work.manifest.steps["frames"] = StepRecord(done=True, details=frames_step(work).details)
+    return work
+
+
+@pytest.mark.parametrize(
+    ("cameras", "settings"),
+    [
+        ([""], {"ev": "-2,0,2", "stride": 2}),
+        ([""], {"ev": "-2,0,2", "stride": 2, "start": 1}),
+        (["a", "b"], {"ev": "-2,0,2"}),
+        (["a", "b"], {"exposures": "auto"}),
+    ],
+)
+def test_the_cycle_goes_on_after_a_gap_that_timestamps_show(
+    cameras: list[str], settings: dict[str, object], tmp_path: Path
+) -> None:
+    work = stamped(tmp_path, dict.fromkeys(cameras, KEPT), **settings)
+    exposure_step(work)
+    used = KEPT[work.config.start :: work.config.stride]
+    phase = (used - used[0]) % 3
+    shown = [phase.tolist().index(p) for p in phase]  # the first frame of that exposure
+    found = brackets(work)
+    assert [found.index(b) for b in found[: len(used)]] == shown
+    assert found == found[: len(used)] * len(cameras) and work.manifest.cycle == 3
 
 
 def test_a_gap_in_the_clock_of_a_video_is_a_gap(tmp_path: Path) -> None:

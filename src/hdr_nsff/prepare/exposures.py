@@ -83,7 +83,7 @@ def exposures_by(
     if work.manifest.num_tracks > 1:
         return track_exposures(work, source, given)
     if given is None:
-        cycles = [exposure.detect_cycle(work.video[own]) for own in cameras]
+        cycles = [cycle_of_line(work, own) for own in cameras]
         if gapped is not None:
             cycles = [gapped.cycle]
         group = exposure_groups([work.video[own] for own in cameras], cycles)
@@ -130,6 +130,20 @@ def cycle_with_gaps(work: Work, given: list[float] | None) -> GappedCycle | None
     if gapped.cycle.length == 1 or (not gapped.gaps and (known == 1).all()):
         return None
     return gapped
+
+
+def cycle_of_line(work: Work, own: list[int], given: list[float] | None = None) -> exposure.Cycle:
+    """The exposure cycle of the frames `own` of a camera or track, by the `given` EVs
+    of all frames, else by brightness. It goes on after gaps that timestamps show.
+    """
+    if given is not None:
+        steps = np.diff([given[i] for i in own])
+    else:
+        steps = exposure.brightness_steps(work.video[own])
+    known = np.diff([work.manifest.frames[i].time for i in own])
+    if by_timestamps(work) and not (known % 1).any():
+        return find_cycle(steps, known.astype(int)).cycle
+    return exposure.cycle_of_steps(steps)
 
 
 def gap_notes(work: Work, gapped: GappedCycle) -> list[str]:
@@ -198,10 +212,7 @@ def own_brackets(work: Work, given: list[float] | None) -> list[int]:
     brackets = [0] * len(work.manifest.frames)
     count = 0
     for own in work.camera_frames():
-        steps = exposure.brightness_steps(work.video[own])
-        if given is not None:
-            steps = np.diff([given[i] for i in own])
-        cycle = exposure.cycle_of_steps(steps)
+        cycle = cycle_of_line(work, own, given)
         for index, bracket in zip(own, cycle.brackets, strict=True):
             brackets[index] = count + bracket
         count += len(cycle.order)
@@ -243,9 +254,11 @@ def given_exposures(work: Work) -> tuple[str, list[float] | None]:
         return "flags", track_cycle(work, cycle)
     if cycle is not None:
         gapped = cycle_with_gaps(work, None)
-        if gapped is not None and exposure.period(cycle_brackets(cycle)) == gapped.cycle.length:
+        if gapped is not None and list_period(cycle) == gapped.cycle.length:
             return "flags", [cycle[(c.start + n) % len(cycle)] for n in gapped.slots]
-        check_cycle(work, cycle, numbers)
+        check_cycle(work, cycle)
+        if by_timestamps(work):
+            numbers = [c.start + round(f.time * c.stride) for f in frames]
         return "flags", [cycle[n % len(cycle)] for n in numbers]
     if "auto" in (c.exposures, c.ev):
         return "brightness", None
@@ -311,25 +324,24 @@ def exif_exposures(work: Work) -> list[float]:
     return known
 
 
-def cycle_brackets(cycle: list[float]) -> list[int]:
-    """The brackets of two rounds of a list of exposures."""
-    return exposure.brackets_by_ev(2 * cycle)[0]
-
-
-def check_cycle(work: Work, cycle: list[float], numbers: list[int]) -> None:
-    """InputError where a list of exposures cannot be the cycle of these frames.
-
-    `numbers` are the positions of the frames in the footage of their camera.
+def list_period(cycle: list[float], stride: int = 1) -> int:
+    """After how many frames a list of exposures repeats, of which every `stride`th
+    counts.
     """
+    two_rounds = [cycle[k * stride % len(cycle)] for k in range(2 * len(cycle))]
+    return exposure.period(exposure.brackets_by_ev(two_rounds)[0])
+
+
+def check_cycle(work: Work, cycle: list[float]) -> None:
+    """InputError where a list of exposures cannot be the cycle of the frames."""
     frames = work.camera_frames()[0]
     if len(cycle) > len(frames):
         raise InputError(
             f"{len(cycle)} exposures listed for {len(frames)} frames; list one cycle only, "
             "or give `--exposures auto`"
         )
-    brackets, _ = exposure.brackets_by_ev([cycle[numbers[i] % len(cycle)] for i in frames])
-    listed = exposure.period(brackets)
-    found = exposure.detect_cycle(work.video[frames])
+    listed = list_period(cycle, work.config.stride)
+    found = cycle_of_line(work, frames)
     if listed % found.length and found.confidence > MIN_CONFIDENCE:
         raise InputError(
             f"{len(cycle)} exposures listed, which repeat every {listed} frames, but the "

@@ -51,13 +51,20 @@ class GappedCycle:
 
     def period(self) -> int:
         """The smallest number of slots after which all exposures repeat."""
-        brackets = np.array(self.cycle.brackets)
-        of_slot = dict(zip(self.slots.tolist(), brackets.tolist(), strict=True))
-        for p in range(1, int(self.slots[-1]) // 2 + 1):
-            pairs = [(b, of_slot[s + p]) for s, b in of_slot.items() if s + p in of_slot]
-            if pairs and all(a == b for a, b in pairs):
-                return p
-        return len(set(brackets.tolist()))
+        return period_in_time(self.cycle.brackets, self.slots.tolist())
+
+
+def period_in_time(brackets: list[int], times: list[float]) -> int:
+    """The smallest time in frames after which all `brackets` (T,) of frames at `times`
+    (T,), the first one 0, repeat; else the number of different brackets.
+    """
+    of_time = dict(zip(times, brackets, strict=True))
+    for p in range(1, int(times[-1]) // 2 + 1):
+        later = {time: round(time + p, 6) for time in times}  # as times are stored
+        pairs = [(b, of_time[later[time]]) for time, b in of_time.items() if later[time] in of_time]
+        if pairs and all(a == b for a, b in pairs):
+            return p
+    return len(set(brackets))
 
 
 def find_cycle(

@@ -22,9 +22,16 @@ from hdr_nsff.prepare.exposures import frame_exposures
 from hdr_nsff.prepare.length import offered_segments
 from hdr_nsff.prepare.lens import describe, undistorted
 from hdr_nsff.prepare.result import StepResult
-from hdr_nsff.prepare.times import frame_rate, frame_seconds, leave_gaps, times_of_slots
+from hdr_nsff.prepare.times import (
+    by_timestamps,
+    frame_rate,
+    frame_seconds,
+    leave_gaps,
+    times_of_slots,
+)
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.radiometry import exposure_cycle as exposure
+from hdr_nsff.radiometry.dropped_frames import period_in_time
 from hdr_nsff.scene.manifest import FrameEntry, Protocol, bracket_problem
 
 MIN_FRAMES = 3  # fewer show no motion
@@ -166,7 +173,7 @@ def exposure_step(work: Work) -> StepResult:
     found = frame_exposures(work)
     for note in found.notes[:MAX_NOTES]:
         say(f"exposure: {note}")
-    m.cycle = found.cycle or exposure.period([found.brackets[i] for i in work.camera_frames()[0]])
+    m.cycle = found.cycle or cycle_length(work, found.brackets)
     if found.reference is None:
         m.reference_bracket = exposure.reference_bracket(work.video, found.brackets)
     else:
@@ -210,6 +217,17 @@ def exposure_step(work: Work) -> StepResult:
             "every_frame_given": found.given and found.source != "flags",
         },
     )
+
+
+def cycle_length(work: Work, brackets: list[int]) -> int:
+    """The length of the exposure cycle of the first camera, across the gaps that
+    timestamps show, by the `brackets` of all frames.
+    """
+    own = work.camera_frames()[0]
+    if by_timestamps(work):
+        times = [work.manifest.frames[i].time for i in own]
+        return period_in_time([brackets[i] for i in own], times)
+    return exposure.period([brackets[i] for i in own])
 
 
 def relative_to(ev: list[float | None], reference: int) -> list[float | None]:
