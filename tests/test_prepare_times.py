@@ -154,6 +154,12 @@ def test_the_cycle_goes_on_after_a_gap_that_timestamps_show(
     assert found == found[: len(used)] * len(cameras) and work.manifest.cycle == 3
 
 
+def test_cameras_of_a_rig_take_turns_across_a_gap(tmp_path: Path) -> None:
+    work = stamped(tmp_path, {"": KEPT}, rig=5)
+    exposure_step(work)
+    assert work.manifest.places == (KEPT % 5).tolist()
+
+
 def test_a_gap_in_the_clock_of_a_video_is_a_gap(tmp_path: Path) -> None:
     path = tmp_path / "clip.mp4"
     with av.open(str(path), "w") as container:

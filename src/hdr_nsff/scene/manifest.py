@@ -196,8 +196,11 @@ class Manifest(Strict):
 
     @property
     def places(self) -> list[int]:
-        """Per frame the camera of the rig that took it; 0 where there is no rig."""
-        return [f.index % self.rig for f in self.frames]
+        """Per frame the camera of the rig that took it; 0 where there is no rig.
+
+        The turn of a camera passes where its frame is missing, too.
+        """
+        return [round(f.time) % self.rig for f in self.frames]
 
     @property
     def known_ev(self) -> list[float | None]:
