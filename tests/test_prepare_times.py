@@ -160,6 +160,25 @@ def test_cameras_of_a_rig_take_turns_across_a_gap(tmp_path: Path) -> None:
     assert work.manifest.places == (KEPT % 5).tolist()
 
 
+def test_cameras_that_miss_different_frames_have_times_of_their_own(tmp_path: Path) -> None:
+    other = np.delete(np.arange(27), [20])
+    work = stamped(tmp_path, {"a": KEPT, "b": other}, exposures="auto")
+    assert times(work) == [*KEPT, *other] and work.manifest.synchronized
+    exposure_step(work)
+    assert times(work) == [*KEPT, *other]
+    assert brackets(work) == [*(KEPT % 3), *(other % 3)]
+
+
+def test_different_gaps_that_share_no_times_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = np.delete(np.arange(27), [20])
+    work = stamped(tmp_path, {"a": KEPT, "b": other}, stride=2)
+    printed = " ".join(capsys.readouterr().err.split())
+    assert "frames: the cameras miss different frames by their timestamps" in printed
+    assert times(work) == [*range(13), *range(13)]
+
+
 def test_a_gap_in_the_clock_of_a_video_is_a_gap(tmp_path: Path) -> None:
     path = tmp_path / "clip.mp4"
     with av.open(str(path), "w") as container:

@@ -22,8 +22,9 @@ def leave_gaps(work: Work, entries: list[FrameEntry], seconds: list[float | None
     """Count the frames that are missing by timestamps in the times of `entries`, in
     place; how many there are. `seconds`: of the entries, by a video's own clock.
 
-    The CSV beside the frames decides before the video. Tracks and cameras that disagree
-    are taken as evenly spaced, and so are the pictures of data sets.
+    The CSV beside the frames decides before the video. Each camera has gaps of its own.
+    Where these put cameras at times that none shares, they are taken as evenly spaced,
+    and so are tracks that disagree, and the pictures of data sets.
     """
     if work.capture is not None:
         return 0
@@ -33,7 +34,7 @@ def leave_gaps(work: Work, entries: list[FrameEntry], seconds: list[float | None
     lines: dict[tuple[int, int], list[int]] = {}
     for k, entry in enumerate(entries):
         lines.setdefault((entry.camera_id, entry.track), []).append(k)
-    found = []
+    found: list[np.ndarray | None] = []
     for line in lines.values():
         known = [seconds[k] for k in line]
         if written:
@@ -43,14 +44,30 @@ def leave_gaps(work: Work, entries: list[FrameEntry], seconds: list[float | None
         found.append(frame_gaps(known, stride))
     if problem := next(filter(None, problems), None):
         say(f"frames: {problem}; all count as evenly spaced")
-    first = found[0]
-    if first is None or not all(g is not None and np.array_equal(g, first) for g in found):
+    gaps = [own for own in found if own is not None]
+    if len(gaps) < len(found):
         return 0
-    times = np.concatenate([[0.0], np.cumsum(first)])
-    for line in lines.values():
+    if problem := disagreement(gaps, any(entry.track for entry in entries)):
+        say(f"frames: {problem}; all count as evenly spaced")
+        return 0
+    for line, own in zip(lines.values(), gaps, strict=True):
+        times = np.concatenate([[0.0], np.cumsum(own)])
         for k, time in zip(line, times.tolist(), strict=True):
             entries[k].time = round(time, 6)
-    return round(float((first - 1).sum() * stride))
+    return max(round(float((own - 1).sum() * stride)) for own in gaps)
+
+
+def disagreement(gaps: list[np.ndarray], tracks: bool) -> str | None:
+    """Why the gaps (T-1,) of cameras, or `tracks` of one, have no common times, in
+    words; None where they have.
+    """
+    if all(np.array_equal(own, gaps[0]) for own in gaps):
+        return None
+    if tracks:
+        return "the tracks miss different frames by their timestamps"
+    if any((own % 1).any() for own in gaps):
+        return "the cameras miss different frames by their timestamps, which needs --stride 1"
+    return None
 
 
 def frame_seconds(
