@@ -84,6 +84,13 @@ def test_times_come_from_where_exposures_come_from(
     assert found == pytest.approx(found[:2] * (FRAMES // 2))
 
 
+def test_many_listed_times_are_kept(tmp_path: Path) -> None:
+    seconds = [0.03, 0.015, 0.008, 0.004, 0.002, 0.001, 0.0005]  # too many for brackets
+    write_video(tmp_path / "clip.mp4", list(clip([0.0], frames=FRAMES)), fps=50)
+    m = prepared(tmp_path, tmp_path / "clip.mp4", exposures=",".join(map(str, seconds)))
+    assert times(m)[:7] == pytest.approx(seconds)
+
+
 def test_metadata_of_one_exposure_are_said_to_leave_it_to_the_brightness(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

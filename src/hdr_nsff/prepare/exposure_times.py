@@ -23,7 +23,8 @@ def exposure_times(work: Work, found: FrameExposures) -> list[float | None]:
         return unknown
     if c.exposures is not None:
         known = [found.ev[bracket] for bracket in found.brackets]
-        return [None if ev is None else 2.0**ev for ev in known]
+        drift = found.drift or [0.0] * len(known)
+        return [None if ev is None else 2.0 ** (ev + d) for ev, d in zip(known, drift, strict=True)]
     if found.estimated and len(found.ev) > 1:
         return unknown
     return times_in_metadata(work)
