@@ -50,6 +50,17 @@ def test_impossible_exposures(exposures: str, tmp_path: Path, capsys: Capture) -
     assert "--exposures" in prepared(capsys, clip(tmp_path / "clip"), f"--exposures={exposures}")
 
 
+@pytest.mark.parametrize("verb", ["run", "prepare"])
+def test_times_in_another_unit(verb: str, tmp_path: Path, capsys: Capture) -> None:
+    folder, out = clip(tmp_path / "clip"), tmp_path / "out"
+    given = "--exposures=2000000,500000"
+    assert "2e+06 seconds is impossible" in refused(capsys, verb, folder, out, given)
+    (folder / "exposures.csv").write_text("frame,exposure\n0,16666667\n1,4166667\n")
+    sentence = refused(capsys, verb, folder, out)
+    assert "line 2: an exposure of 1.667e+07 seconds" in sentence and "`exposure_ns`" in sentence
+    assert not out.exists()
+
+
 def test_a_csv_that_leaves_frames_out(tmp_path: Path, capsys: Capture) -> None:
     folder = clip(tmp_path / "clip")
     (folder / "exposures.csv").write_text("file,ev\n000.png,-2\n")

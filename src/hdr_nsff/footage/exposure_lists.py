@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 
 from hdr_nsff.core.errors import InputError, check_number, shorten
 from hdr_nsff.footage.footage import Footage
-from hdr_nsff.scene.manifest import MAX_EV
+from hdr_nsff.scene.manifest import MAX_EV, MAX_SECONDS
 
 LIST = "exposures.csv"  # in a folder of frames
 # columns of a CSV: times, and the seconds of their unit
@@ -43,7 +43,11 @@ def parse_exposures(exposures: str | None, ev: str | None) -> list[float] | None
         raise InputError("--exposures and --ev both given; leave one out")
     if times_given:
         assert exposures is not None
-        return [log2_seconds(text, "--exposures") for text in exposures.split(",")]
+        texts = exposures.split(",")
+        advice = "write times in seconds like 1/250, or relative exposures as `--ev`"
+        for text in texts:
+            check_seconds(parse_number(text, "--exposures"), "--exposures", advice)
+        return [log2_seconds(text, "--exposures") for text in texts]
     if ev is None or ev.strip() == "auto":
         return None
     cycle = [parse_number(text, "--ev") for text in ev.split(",")]
@@ -75,6 +79,12 @@ def log2_seconds(text: str, where: str) -> float:
             f"{where}: an exposure of {shorten(text)} seconds is impossible; write times like 1/250"
         )
     return math.log2(seconds)
+
+
+def check_seconds(seconds: float, where: str, advice: str) -> None:
+    """InputError with `advice` for a time that no camera exposes."""
+    if seconds > MAX_SECONDS:
+        raise InputError(f"{where}: an exposure of {seconds:.4g} seconds is impossible; {advice}")
 
 
 # CSV
@@ -232,7 +242,12 @@ def frame_key(column: str, text: str) -> str:
 
 def seconds_of_cell(column: str, text: str, where: str) -> float | None:
     """The exposure time in a cell; None where its column has none."""
-    return parse_number(text, where) * TIMES[column] if column in TIMES else None
+    if column not in TIMES:
+        return None
+    seconds = parse_number(text, where) * TIMES[column]
+    advice = "name the column `exposure_us` or `exposure_ns` where times are in these units"
+    check_seconds(seconds, where, f"{advice}, or `ev` where they are log2 exposures")
+    return seconds
 
 
 def find_columns(path: Path, columns: Sequence[str]) -> tuple[str, list[str]]:
@@ -283,9 +298,9 @@ def read_exif_ev(path: Path) -> float | None:
 
 
 def read_exif_seconds(path: Path) -> float | None:
-    """The exposure time in the same tags; None without one above 0."""
+    """The exposure time in the same tags; None without a possible one."""
     seconds = exif_number(read_exif(path), "ExposureTime") or 0.0
-    return seconds if 0 < seconds < math.inf else None
+    return seconds if 0 < seconds <= MAX_SECONDS else None
 
 
 def read_exif(path: Path) -> Mapping[str, Any]:

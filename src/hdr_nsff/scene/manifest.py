@@ -28,6 +28,7 @@ Protocol = Literal["novel-view", "novel-view-time"]
 # single precision.
 MAX_NUMBER = 1e15
 MAX_EV = 60.0  # stops from the reference
+MAX_SECONDS = 1e6  # of an exposure
 
 
 class Strict(BaseModel):
@@ -85,7 +86,7 @@ class FrameEntry(Strict):
     # stops by which it differs from its bracket's (auto exposure), None: not at all
     drift: float | None = None
     # seconds for which the shutter was open, None where unknown
-    exposure_time: float | None = Field(default=None, gt=0, le=1e6)
+    exposure_time: float | None = Field(default=None, gt=0, le=MAX_SECONDS)
     # stops (3,) by which its white balance differs from the clip's, None: not at all
     white_balance: list[float] | None = None
     split: Split = "train"
