@@ -44,6 +44,12 @@ def test_a_list_and_the_brightness_find_the_same_brackets(tmp_path: Path) -> Non
     assert np.diff(evs).tolist() == [2, -2, -2]
 
 
+def test_a_listed_cycle_is_known_in_a_clip_that_is_too_short_to_show_it(tmp_path: Path) -> None:
+    work = work_on(tmp_path, clip([-2, 0, 2, 0], frames=7), ev="-2,0,2,0")
+    exposure_step(work)
+    assert work.manifest.cycle == 4
+
+
 def test_the_frames_of_brackets_are_named_by_their_place_in_the_cycle(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

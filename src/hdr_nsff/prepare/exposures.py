@@ -49,9 +49,8 @@ class FrameExposures:
     reference: int | None = None  # bracket; None: the best exposed one
     notes: tuple[str, ...] = ()  # sentences for people
     drift: tuple[float, ...] = ()  # given, per frame: stops from its bracket; empty: none
-    # where frames are missing: per frame its time, and the length of the cycle in these
-    slots: tuple[float, ...] = ()
-    cycle: int | None = None
+    slots: tuple[float, ...] = ()  # where frames are missing: per frame its time
+    cycle: int | None = None  # its length; None: as the brackets show it
 
 
 def frame_exposures(work: Work) -> FrameExposures:
@@ -59,11 +58,15 @@ def frame_exposures(work: Work) -> FrameExposures:
     source, given = given_exposures(work)
     gapped = cycle_with_gaps(work, given)
     found = exposures_by(work, source, given, gapped)
+    listed = parse_exposures(work.config.exposures, work.config.ev)
+    in_turn = work.manifest.num_tracks == 1 and work.capture is None and not found.drift
+    if listed is not None and in_turn:
+        found = replace(found, cycle=list_period(listed, work.config.stride))
     if gapped is None:
         return replace(found, notes=(*stride_notes(work, found), *found.notes))
     slots = tuple(gapped.slots.astype(float).tolist())
     notes = (*gap_notes(work, gapped), *found.notes)
-    return replace(found, slots=slots, cycle=gapped.period(), notes=notes)
+    return replace(found, slots=slots, cycle=found.cycle or gapped.period(), notes=notes)
 
 
 def exposures_by(
