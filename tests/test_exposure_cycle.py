@@ -136,6 +136,13 @@ def test_equal_values_share_a_bracket():
     assert ev == [-2, 0, 2]
 
 
+@given(st.lists(st.floats(-0.0045, 0.0045), min_size=8, max_size=8), st.floats(-3, 3))
+def test_jitter_never_splits_a_bracket(jitter, level):
+    evs = [level + 2 * (t % 2) + own for t, own in enumerate(jitter)]
+    brackets, ev = brackets_by_ev(evs)
+    assert brackets == [0, 1] * 4 and ev == evs[:2]
+
+
 def test_a_correct_list_causes_no_warning_and_wrong_ones_do():
     video = clip([-2, 0, 2])
     assert contradictions(video, [-2, 0, 2] * 8) == []

@@ -20,6 +20,7 @@ MAX_CYCLE = 6  # frames: the longest cycle looked for, two more than cameras off
 # positions of a cycle that are closer than this share a bracket (hand-chosen on
 # recorded clips: cameras step by 1/3 EV at least)
 MIN_STEP = 0.3
+SAME_EV = 0.01  # given exposures that are closer count as one
 GAMMA = 2.2  # of the assumed response
 BINS = 1024  # of the histograms; 8-bit codes fall four bins apart
 QUANTILES = np.linspace(0.05, 0.95, 37)  # they stand for a frame's brightness
@@ -207,13 +208,16 @@ def period(brackets: list[int]) -> int:
 def brackets_by_ev(ev: list[float]) -> tuple[list[int], list[float]]:
     """Brackets from the EV of every frame: (bracket per frame, EV per bracket).
 
-    Frames with the same EV (to 0.01) share a bracket; brackets are numbered in the
-    order of their first frames.
+    From the darkest on, frames within `SAME_EV` of a bracket's darkest join it;
+    brackets are numbered in the order of their first frames.
     """
-    rounded = [round(v, 2) for v in ev]
-    occurring = list(dict.fromkeys(rounded))
-    brackets = [occurring.index(v) for v in rounded]
-    return brackets, [ev[rounded.index(v)] for v in occurring]
+    darkest: list[float] = []  # of every bracket
+    for value in sorted(ev):
+        if not darkest or value - darkest[-1] > SAME_EV:
+            darkest.append(value)
+    ranks = (np.searchsorted(darkest, ev, side="right") - 1).tolist()
+    occurring = list(dict.fromkeys(ranks))
+    return [occurring.index(r) for r in ranks], [ev[ranks.index(r)] for r in occurring]
 
 
 def contradictions(
