@@ -162,6 +162,25 @@ def test_the_exposures_of_synchronized_cameras_drift_from_brackets_of_their_own(
     assert drift_of_frames(work, None) == {f.index: f.drift for f in frames}
 
 
+def test_a_list_of_drifting_exposures_of_several_cameras_gives_one_bracket_each(
+    tmp_path: Path,
+) -> None:
+    rows = ["file,ev"]
+    drift = np.linspace(-0.5, 0.5, 20)
+    for camera in "ab":
+        for t, frame in enumerate(clip([0], frames=20)):
+            write_png(tmp_path / f"clip/{camera}/{t:03d}.png", frame)
+            rows.append(f"{camera}/{t:03d}.png,{drift[t] - 2 * (camera == 'b')}")
+    (tmp_path / "clip/exposures.csv").write_text("\n".join(rows))
+    config = PrepareConfig(tmp_path / "clip", tmp_path / "scene")
+    work = Work(config, open_footage(config.clip), Manifest(source="clip", width=1, height=1))
+    frames_step(work)
+    exposure_step(work)
+    assert [f.bracket for f in work.manifest.frames] == [0] * 20 + [1] * 20
+    assert np.ptp(work.manifest.bracket_ev) == pytest.approx(2)
+    np.testing.assert_allclose([f.drift for f in work.manifest.frames], [*drift, *drift])
+
+
 def test_a_mask_of_another_size_is_named_with_the_way_out(tmp_path: Path) -> None:
     work = work_on(tmp_path, np.full((6, 24, 32, 3), 0.5, np.float32), ev="0,2")
     exposure_step(work)

@@ -94,9 +94,9 @@ def exposures_by(
         unknown: list[float | None] = [None] * (max(brackets) + 1)
         notes = cycle_notes(work, cycles, group)
         return FrameExposures(source, brackets, unknown, False, True, notes=tuple(notes))
-    many = len(exposure.brackets_by_ev(given)[1]) > exposure.MAX_CYCLE
+    different = [len(exposure.brackets_by_ev([given[i] for i in own])[1]) for own in cameras]
     drifts = source in (GOPRO, EXIF) and max(given) - min(given) < exposure.MIN_STEP
-    if source == GOPRO or drifts or (many and len(cameras) == 1):
+    if source == GOPRO or drifts or max(different) > exposure.MAX_CYCLE:
         own = own_brackets(work, given) if gapped is None else gapped.cycle.brackets
         found = drifting_exposures(source, given, own)
         return replace(found, notes=(*found.notes, *contradictions(work, cameras, given)))
