@@ -388,6 +388,19 @@ def test_all_cameras_of_a_rig_are_looked_at_for_their_exposure(tmp_path: Path) -
     assert texts[0] == "the 2 cameras are exposed alike (by brightness)"
 
 
+def test_cycles_of_cameras_that_differ_ask_for_a_list_unless_one_is_given(tmp_path: Path) -> None:
+    folder = rig_of(tmp_path, {"a": -1.0, "b": -1.0}, FRAMES)
+    rows = [f"a/{t:03d}.png,0" for t in range(FRAMES)]
+    rows += [f"b/{t:03d}.png,{-2 * (t % 2)}" for t in range(FRAMES)]
+    (folder / "exposures.csv").write_text("\n".join(["file,ev", *rows]))
+    facts, _, _ = measured(folder)
+    texts = [f.text + f.advice for f in judge(facts) if f.subject == "cameras"]
+    assert texts[0] == "the exposures of the cameras repeat after [1, 2] frames (by exposures.csv)"
+    unlisted = replace(facts, exposure=replace(facts.exposure, given=None))
+    texts = [f.text + f.advice for f in judge(unlisted) if f.subject == "cameras"]
+    assert "disagree" in texts[0] and texts[0].endswith("list the exposures in exposures.csv")
+
+
 def test_a_list_that_one_camera_contradicts_is_reported(tmp_path: Path) -> None:
     folder = rig_of(tmp_path, {"a": -1.0, "b": -1.0}, FRAMES)
     rows = [f"a/{t:03d}.png,0" for t in range(FRAMES)]

@@ -181,7 +181,10 @@ def judge_cameras(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
     lengths = [camera.cycle for camera in facts.each_camera]
     span = different_cameras(facts, tuning)
     by = facts.exposure.given or "brightness"
-    if len(set(lengths)) > 1:
+    if len(set(lengths)) > 1 and facts.exposure.given is not None:
+        text = f"the exposures of the {what} repeat after {lengths} frames (by {by})"
+        yield Finding("note", what, text)
+    elif len(set(lengths)) > 1:
         text = f"the {what} disagree on the length of the exposure cycle: {lengths}"
         yield Finding("warning", what, text, "list the exposures in exposures.csv")
     elif span:
