@@ -62,9 +62,7 @@ def measure_timing(footage: Footage) -> dict[str, Any]:
     seconds: list[float | None] = []
     problem = None
     if written:
-        names = [path.relative_to(footage.root).as_posix() for path in files]
-        if footage.video:
-            names = [f"{files[0].name}#{number}" for number in range(footage.count)]
+        names = [footage.frame_name(files, number) for number in range(footage.count)]
         seconds = [row_of(written, name, number) for number, name in enumerate(names)]
         problem = timestamps_problem(seconds, names)
     elif footage.video:

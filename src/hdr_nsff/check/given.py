@@ -90,10 +90,9 @@ def given_exposures(footage: Footage, count: int) -> list[GivenExposures | None]
 
 def frame_names(footage: Footage, camera: int, count: int) -> list[str]:
     """The names of the first `count` frames of a camera, as in a list."""
-    files = [path.relative_to(footage.root).as_posix() for path in footage.cameras[camera]]
-    if footage.video:
-        return [f"{files[0]}#{number}" for number in range(count)]
-    return files[:count]
+    files = footage.cameras[camera]
+    known = count if footage.video else min(count, len(files))
+    return [footage.frame_name(files, number) for number in range(known)]
 
 
 def metadata_ev(footage: Footage, camera: int, count: int) -> list[float]:

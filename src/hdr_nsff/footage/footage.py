@@ -101,6 +101,13 @@ class Footage:
         """Every file by its name relative to the footage."""
         return {f.relative_to(self.root).as_posix(): f for files in self.cameras for f in files}
 
+    def frame_name(self, files: list[Path], number: int) -> str:
+        """The name of a frame of the camera with `files`: that of its file, relative to
+        the footage; `#number` follows for a frame of a video.
+        """
+        name = files[0 if self.video else number].relative_to(self.root).as_posix()
+        return f"{name}#{number}" if self.video else name
+
     @property
     def lossless(self) -> bool:
         """Whether all frames are of formats that keep the noise of the sensor."""

@@ -129,15 +129,15 @@ def decode(
 ) -> Iterator[tuple[int, str, np.ndarray, float | None]]:
     """(number, source, image (H, W, 3), seconds) of the chosen frames of one camera."""
     if footage.video:
-        yield from decode_video(files[0], chosen)
+        for number, image, seconds in decode_video(files[0], chosen):
+            yield number, footage.frame_name(files, number), image, seconds
         return
     for number, path in list(enumerate(files))[chosen.start : chosen.stop : chosen.step]:
-        source = path.relative_to(footage.path).as_posix()
-        yield number, source, read_frame(path, footage.over), None
+        yield number, footage.frame_name(files, number), read_frame(path, footage.over), None
 
 
-def decode_video(path: Path, chosen: range) -> Iterator[tuple[int, str, np.ndarray, float]]:
-    """(number, source, image (H, W, 3), seconds) of the chosen frames of a video.
+def decode_video(path: Path, chosen: range) -> Iterator[tuple[int, np.ndarray, float]]:
+    """(number, image (H, W, 3), seconds) of the chosen frames of a video.
 
     InputError where it ends before the duration in its header.
     """
@@ -151,7 +151,7 @@ def decode_video(path: Path, chosen: range) -> Iterator[tuple[int, str, np.ndarr
             transfer = TRANSFERS.get(info.transfer)
             if transfer is not None:
                 image = encode_signal(image, transfer, info.primaries == REC2020_CODE)
-            yield number, f"{path.name}#{number}", image, seconds
+            yield number, image, seconds
     if last + MAX_MISSING_FRAMES / info.fps < info.seconds and not is_whole(path, info, last):
         raise InputError(
             f"{path}: the video is cut short ({last:.1f} of {info.seconds:.1f} s can be read); "

@@ -39,7 +39,4 @@ def frames_to_use(config: PrepareConfig, footage: Footage) -> Iterator[tuple[str
         certain = footage.count - MAX_MISSING_FRAMES if footage.video else len(files)
         stop = certain if config.end is None else min(certain, config.end)
         for number in range(config.start, stop, config.stride):
-            if footage.video:
-                yield f"{files[0].name}#{number}", number
-            else:
-                yield files[number].relative_to(footage.path).as_posix(), number
+            yield footage.frame_name(files, number), number
