@@ -6,13 +6,19 @@ import numpy as np
 import pytest
 from posed_clips import FOCAL, PLACES, H, K, W, sliding
 
-from hdr_nsff.core.images import read_image, write_png
-from hdr_nsff.core.io import read_npy
+from hdr_nsff.core.images import read_image, read_mask, write_png
+from hdr_nsff.core.io import read_npy, write_npy
 from hdr_nsff.geometry import pinhole
-from hdr_nsff.geometry.lens import Lens, distorted_picture, undistorted_picture
+from hdr_nsff.geometry.lens import (
+    Lens,
+    distorted_picture,
+    undistorted_flow,
+    undistorted_picture,
+    undistortion,
+)
 from hdr_nsff.prepare.prepare import STEPS, begin
 from hdr_nsff.prepare.table import run_steps
-from hdr_nsff.prepare.undistort import UNDISTORTED_FLOW, undistorted_flow, undistortion
+from hdr_nsff.prepare.undistort import UNDISTORTED_FLOW
 from hdr_nsff.prepare.work import PrepareConfig
 from hdr_nsff.scene.manifest import Manifest
 
@@ -98,3 +104,36 @@ def test_a_command_that_is_stopped_meanwhile_ends_at_the_same(scene, footage, tm
         assert np.allclose(f.c2w, g.c2w, atol=1e-6) and np.allclose(f.K, g.K)
     nothing = {name: replace(step, run=stopped) for name, step in UP_TO_POSES.items()}
     run_steps(begin(config), nothing)  # all is done
+
+
+def test_given_maps_are_undistorted_like_the_frames_whenever_they_are_read(tmp_path):
+    square = np.zeros((H, W), bool)
+    square[4:20, 6:26] = True
+    for t, picture in enumerate(sliding(PLACES[:4])):
+        picture = np.where(square[..., None], (1, 0, 0), picture / 2)
+        write_png(tmp_path / f"clip/{t}.png", picture)
+        write_png(tmp_path / f"masks/{t}.png", square)
+        write_npy(tmp_path / f"depth/{t}.npy", np.where(square, 2.0, 4.0).astype(np.float32))
+        for j in range(4):
+            flow = np.where(square[..., None], [6.0, 3.0], 0).astype(np.float32)
+            write_npy(tmp_path / f"flow/{t:05d}_{j:05d}.npy", flow)
+    folders = {name: tmp_path / name for name in ("masks", "depth", "flow")}
+    config = PrepareConfig(
+        tmp_path / "clip", tmp_path / "scene", tripod=True, lens_distortion="-0.3", **folders
+    )  # the lens is known after the flow has been read
+    steps = {name: STEPS[name] for name in (*UP_TO_POSES, "masks", "static_depth")}
+    run_steps(begin(config), steps)
+    late = read_npy(config.out / Manifest.load(config.out).frames[1].raw_flow[2].flow)
+    run_steps(begin(replace(config, redo=("flow",))), steps)
+    f = Manifest.load(config.out).frames[1]
+    r, g, _ = np.moveaxis(read_image(config.out / f.image), -1, 0)
+    red = r - g > 0.5
+    assert (red ^ square).sum() > 50
+    for found in (
+        read_mask(config.out / str(f.mask)),
+        read_npy(config.out / str(f.static_disparity)) > 0.3,
+        np.linalg.norm(late, axis=-1) > 3,
+    ):
+        assert (found & red).sum() > 0.95 * (found | red).sum()
+    assert set(np.unique(read_npy(config.out / str(f.static_disparity)))) == {0.25, 0.5}
+    assert np.array_equal(read_npy(config.out / f.raw_flow[2].flow), late)

@@ -145,6 +145,16 @@ def undistorted_picture(picture: np.ndarray, lens: Lens) -> np.ndarray:
     return sample(picture, lens.distort(pinhole.pixel_centers(height, width), lens.pinhole()))
 
 
+def undistorted_map(values: np.ndarray, lens: Lens) -> np.ndarray:
+    """A map (H, W) of a recorded picture as that of the pinhole camera
+    `lens.pinhole()`, from the nearest pixels: what it holds has no mean across edges.
+    """
+    height, width = values.shape
+    lens = lens.resized(width, height)
+    recorded = lens.distort(pinhole.pixel_centers(height, width), lens.pinhole())
+    return sample_nearest(values, recorded)
+
+
 def distorted_picture(picture: np.ndarray, K: np.ndarray, lens: Lens) -> np.ndarray:
     """The picture (H, W) or (H, W, C) that the lens records of what a pinhole camera
     `K` (3, 3) sees as `picture`; it has the size of the lens.
@@ -177,3 +187,25 @@ def sample_nearest(picture: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     x, y = places[..., 0], places[..., 1]
     values = np.ascontiguousarray(picture)
     return np.asarray(cv2.remap(values, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE))
+
+
+def undistortion(lens: Lens) -> np.ndarray:
+    """By how much (H, W, 2) px undistorting moves each pixel of a recorded picture."""
+    return lens.undistorted_pixels() - pinhole.pixel_centers(lens.height, lens.width)
+
+
+def undistorted_flow(
+    flow: np.ndarray, valid: np.ndarray, lens: Lens, shift: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Flow (H, W, 2) px and its validity (H, W) between recorded pictures, as a pinhole
+    camera would have seen it; `shift` is that of `undistortion`.
+
+    It is not valid where it leaves the undistorted picture.
+    """
+    size = np.array([lens.width, lens.height])
+    pixels = pinhole.pixel_centers(lens.height, lens.width)
+    recorded = lens.distort(pixels, lens.pinhole())
+    target = recorded + sample(flow, recorded, linear=True)
+    target = target + sample(shift, target, linear=True)
+    inside = ((target >= 0) & (target <= size)).all(-1)
+    return (target - pixels).astype(np.float32), sample(valid, recorded) & inside

@@ -1,4 +1,4 @@
-"""Masks and depth maps that the user gives: one file per frame, in order.
+"""Masks and depth maps that the user gives: one file per frame as recorded, in order.
 
 They are checked as soon as the frames are known, before any step that takes long.
 """
@@ -14,6 +14,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import mask_gray
 from hdr_nsff.footage.depth_files import read_depth
 from hdr_nsff.footage.frame_files import RECORDED, natural_key, sorted_folders
+from hdr_nsff.prepare.lens import undistorted
 from hdr_nsff.prepare.work import Work
 
 DEPTH_FILES = {".npy", ".exr", ".png"}
@@ -31,7 +32,7 @@ def check_given_maps(work: Work) -> None:
 
 
 def user_masks(work: Work, folder: Path) -> np.ndarray:
-    """The moving masks (T, H, W) in the user's folder."""
+    """The moving masks (T, H, W) in the user's folder, undistorted like the frames."""
     m = work.manifest
     masks = []
     brightest = 0.0
@@ -44,7 +45,7 @@ def user_masks(work: Work, folder: Path) -> np.ndarray:
                 f"--mask {path}: the mask is {mask.shape[1]}x{mask.shape[0]}, "
                 f"frame {f.index} is {m.width}x{m.height}; make it that size"
             )
-        masks.append(mask)
+        masks.append(undistorted(work, mask, f.camera_id))
     if 0 < brightest <= 0.5:
         raise InputError(
             f"--mask {folder}: no mask is white anywhere, the brightest pixel is "

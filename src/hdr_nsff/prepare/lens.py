@@ -7,7 +7,7 @@ finds is known only later, see `undistort.py`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,13 +17,23 @@ from hdr_nsff.core.errors import InputError, shorten
 from hdr_nsff.footage.lens_files import read_lens
 from hdr_nsff.footage.pose_files import MAX_ASPECT_ERROR, locate, read_given, rows_of_cameras
 from hdr_nsff.footage.pose_formats import common_lens, distorted
-from hdr_nsff.geometry.lens import Lens, undistorted_picture
+from hdr_nsff.geometry.lens import (
+    Lens,
+    undistorted_flow,
+    undistorted_map,
+    undistorted_picture,
+    undistortion,
+)
 from hdr_nsff.prepare.work import Part, PrepareConfig, Work
 from hdr_nsff.priors.poses.lens import LensChoice
-from hdr_nsff.scene.manifest import LensEntry, Manifest
+from hdr_nsff.scene.manifest import FrameEntry, LensEntry, Manifest
 
 MAX_K = 10.0  # no lens has more: beyond it, a number is a mistake
 LENS_ADVICE = "write auto, none, K1, or K1,K2, such as -0.2,0.03, or the file of a calibration"
+
+
+# of a camera_id, flow (H, W, 2) px and its validity (H, W): both without distortion
+FlowUndistorter = Callable[[int, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 class DistortedFramesError(Exception):
@@ -139,12 +149,40 @@ def lens_to_find(work: Work) -> LensChoice:
     return choice
 
 
-def undistorted(work: Work, rgb: np.ndarray, camera_id: int) -> np.ndarray:
-    """A frame (H, W, 3) of a camera without the distortion of its lens, where that is
-    known.
+def undistorted(work: Work, picture: np.ndarray, camera_id: int) -> np.ndarray:
+    """A frame (H, W, 3) of a camera, or its mask (H, W), without the distortion of its
+    lens, where that is known.
     """
     entry = work.manifest.lens.get(camera_id)
-    return rgb if entry is None else undistorted_picture(rgb, entry.lens())
+    return picture if entry is None else undistorted_picture(picture, entry.lens())
+
+
+def undistorted_maps(work: Work, frames: Sequence[FrameEntry], maps: np.ndarray) -> np.ndarray:
+    """Maps (T, H, W) of recorded `frames` without the distortion of their lenses, where
+    these are known.
+    """
+    if not work.manifest.lens:
+        return maps
+    entries = [work.manifest.lens.get(f.camera_id) for f in frames]
+    pairs = zip(maps, entries, strict=True)
+    return np.stack([m if e is None else undistorted_map(m, e.lens()) for m, e in pairs])
+
+
+def flow_undistorter(lenses: Mapping[int, Lens], width: int, height: int) -> FlowUndistorter:
+    """Undistorts flow of cameras that have one of the `lenses`, and leaves that of
+    others as it is; frames are `width` x `height`.
+    """
+    resized = {camera_id: lens.resized(width, height) for camera_id, lens in lenses.items()}
+    shifts = {camera_id: undistortion(lens) for camera_id, lens in resized.items()}
+
+    def undistort(
+        camera_id: int, flow: np.ndarray, valid: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        if camera_id not in resized:
+            return flow, valid
+        return undistorted_flow(flow, valid, resized[camera_id], shifts[camera_id])
+
+    return undistort
 
 
 def describe(lenses: dict[int, LensEntry]) -> str:

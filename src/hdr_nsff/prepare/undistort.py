@@ -12,10 +12,9 @@ import numpy as np
 from hdr_nsff.core.images import read_mask
 from hdr_nsff.core.io import read_npy
 from hdr_nsff.core.progress import say, track
-from hdr_nsff.geometry import pinhole
-from hdr_nsff.geometry.lens import Lens, sample
+from hdr_nsff.geometry.lens import Lens
 from hdr_nsff.prepare.engine import Step, next_attempt, remove, step_key
-from hdr_nsff.prepare.lens import describe
+from hdr_nsff.prepare.lens import describe, flow_undistorter
 from hdr_nsff.prepare.steps.flow import flow_files, write_flow
 from hdr_nsff.prepare.work import StepName, Work
 from hdr_nsff.scene.manifest import FlowFiles, LensEntry
@@ -53,38 +52,13 @@ def start_over(work: Work, steps: Mapping[StepName, Step], lenses: dict[int, Len
 def undistort_flow(work: Work, lenses: dict[int, Lens]) -> dict[int, dict[int, FlowFiles]]:
     """Write the flow of all pairs as undistorted frames have it; the new files."""
     frames, folder = work.manifest.frames, work.folder
-    shifts = {c: undistortion(lens) for c, lens in lenses.items()}
+    undistorted = flow_undistorter(lenses, work.manifest.width, work.manifest.height)
     found: dict[int, dict[int, FlowFiles]] = {}
     pairs = [(f, j, files) for f in frames for j, files in f.raw_flow.items()]
     for f, j, files in track(pairs, "flow: undistorted"):
         flow = read_npy(folder / files.flow).astype(np.float32)
         valid = read_mask(folder / files.valid)
         names = flow_files(UNDISTORTED_FLOW, (f.index, j))
-        if f.camera_id in lenses:
-            lens = lenses[f.camera_id]
-            flow, valid = undistorted_flow(flow, valid, lens, shifts[f.camera_id])
-        write_flow(work, names, flow, valid)
+        write_flow(work, names, *undistorted(f.camera_id, flow, valid))
         found.setdefault(f.index, {})[j] = names
     return found
-
-
-def undistortion(lens: Lens) -> np.ndarray:
-    """By how much (H, W, 2) px undistorting moves each pixel of a recorded picture."""
-    return lens.undistorted_pixels() - pinhole.pixel_centers(lens.height, lens.width)
-
-
-def undistorted_flow(
-    flow: np.ndarray, valid: np.ndarray, lens: Lens, shift: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Flow (H, W, 2) px and its validity (H, W) between recorded pictures, as a pinhole
-    camera would have seen it; `shift` is that of `undistortion`.
-
-    It is not valid where it leaves the undistorted picture.
-    """
-    size = np.array([lens.width, lens.height])
-    pixels = pinhole.pixel_centers(lens.height, lens.width)
-    recorded = lens.distort(pixels, lens.pinhole())
-    target = recorded + sample(flow, recorded, linear=True)
-    target = target + sample(shift, target, linear=True)
-    inside = ((target >= 0) & (target <= size)).all(-1)
-    return (target - pixels).astype(np.float32), sample(valid, recorded) & inside

@@ -12,6 +12,7 @@ from hdr_nsff.core.io import write_half
 from hdr_nsff.core.progress import track
 from hdr_nsff.core.tensors import pick_device
 from hdr_nsff.footage.datasets import maps
+from hdr_nsff.prepare.lens import FlowUndistorter, flow_undistorter
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.priors.flow.sources import fallback_note, flow_source, resolve_source
@@ -24,13 +25,16 @@ Pair = tuple[int, int]  # frame indices (from, to)
 
 def find_flow(work: Work) -> StepResult:
     """Optical flow between neighbors, from a folder or estimated, a few pairs at a time
-    so that a killed run keeps them.
+    so that a killed run keeps them. Given flow is that of frames as recorded, and is
+    undistorted as they are.
     """
     m, c = work.manifest, work.config
+    lenses = {camera_id: entry.lens() for camera_id, entry in m.lens.items()}
+    undistorted = flow_undistorter(lenses, m.width, m.height)
     pairs = flow_pairs(m.frames)
     names = {pair: flow_files("raw_flow", pair) for pair in pairs}
     missing = [pair for pair in pairs if not stored(work, names[pair])]
-    given = store_given_flow(work, names)
+    given = store_given_flow(work, names, undistorted)
     missing = [pair for pair in missing if pair not in given]
     from_folder = isinstance(c.flow, Path)
     neighbors, equal = learning_pairs(m.frames)
@@ -41,6 +45,8 @@ def find_flow(work: Work) -> StepResult:
     for chunk in track(chunks, "flow"):
         found, valid = source(*work.equalized, np.array(chunk))
         for pair, f, v in zip(chunk, found, valid, strict=True):
+            if from_folder:
+                f, v = undistorted(m.frames[pair[0]].camera_id, f, v)
             write_flow(work, names[pair], f, v)
     share = float(np.mean([read_mask(work.folder / n.valid).mean() for n in names.values()]))
     num_given = len(pairs) if from_folder else len(given)
@@ -119,8 +125,10 @@ def learning_pairs(frames: list[FrameEntry]) -> tuple[list[Pair], list[Pair]]:
     return neighbors, equal
 
 
-def store_given_flow(work: Work, names: dict[Pair, FlowFiles]) -> set[Pair]:
-    """Write the flow that a data set gives; the pairs it gives."""
+def store_given_flow(
+    work: Work, names: dict[Pair, FlowFiles], undistorted: FlowUndistorter
+) -> set[Pair]:
+    """Write the flow that a data set gives, `undistorted`; the pairs it gives."""
     m = work.manifest
     found: set[Pair] = set()
     if work.capture_with("flow") is None:
@@ -131,7 +139,8 @@ def store_given_flow(work: Work, names: dict[Pair, FlowFiles]) -> set[Pair]:
             continue
         found.add((i, j))
         if not stored(work, files):
-            write_flow(work, files, *maps.flow_map(path, (m.height, m.width)))
+            flow, valid = maps.flow_map(path, (m.height, m.width))
+            write_flow(work, files, *undistorted(m.frames[i].camera_id, flow, valid))
     return found
 
 

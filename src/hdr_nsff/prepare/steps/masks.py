@@ -8,6 +8,7 @@ import numpy as np
 
 from hdr_nsff.footage.datasets import maps
 from hdr_nsff.prepare.given_maps import user_masks
+from hdr_nsff.prepare.lens import undistorted
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.steps.neural import sam2_masks
 from hdr_nsff.prepare.still_cameras import still_cameras
@@ -87,5 +88,5 @@ def given_masks(work: Work) -> np.ndarray:
         mask = np.zeros(size, bool)
         if path is not None:
             mask = maps.moving_mask(path, size, capture.white_moves)
-        masks.append(mask)
+        masks.append(undistorted(work, mask, f.camera_id))
     return np.stack(masks)

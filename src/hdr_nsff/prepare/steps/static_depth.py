@@ -18,6 +18,7 @@ from hdr_nsff.core.stack import ArrayStack, Stack, by_key, spread_frames
 from hdr_nsff.footage.datasets import maps
 from hdr_nsff.footage.depth_files import read_depth_files
 from hdr_nsff.prepare.given_maps import depth_files
+from hdr_nsff.prepare.lens import undistorted_maps
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.steps.neural import network_depth
 from hdr_nsff.prepare.still_cameras import still_cameras
@@ -151,6 +152,9 @@ def data_set_depth(work: Work) -> Depth:
     assert capture is not None
     pictures = [work.picture(f) for f in work.train]
     disparity, confidence, how = maps.disparities(capture, pictures, (m.height, m.width))
+    disparity, confidence = (
+        undistorted_maps(work, work.train, values) for values in (disparity, confidence)
+    )
     changes: dict[str, Any] = {}
     if capture.depth_kind == "relative":
         changes["depth_kind"] = "relative"
@@ -166,7 +170,9 @@ def user_depth(work: Work, folder: Path) -> Depth:
     files = depth_files(work, folder)
     disparity, confidence = read_depth_files(files, kind, (m.height, m.width))
     index = [f.index for f in work.train]
-    disparity, confidence = disparity[index], confidence[index]
+    disparity, confidence = (
+        undistorted_maps(work, work.train, values[index]) for values in (disparity, confidence)
+    )
     changes: dict[str, Any] = {}
     if kind == "relative":
         changes["depth_kind"] = "relative"
