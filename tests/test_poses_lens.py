@@ -5,13 +5,15 @@ import posed_clips
 import pytest
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.footage.colmap import ColmapCamera, ColmapModel
+from hdr_nsff.core.tensors import CPU
+from hdr_nsff.footage.colmap import ColmapCamera, ColmapImage, ColmapModel
 from hdr_nsff.geometry.lens import Lens, distorted_picture
 from hdr_nsff.priors.poses import sfm
 from hdr_nsff.priors.poses.estimate import PosesTuning, estimate_poses
 from hdr_nsff.priors.poses.lens import LensTuning, bent_cameras
 from hdr_nsff.priors.poses.mapper import Mapper
-from hdr_nsff.priors.poses.reconstruct import ReconstructionTuning
+from hdr_nsff.priors.poses.reconstruct import ReconstructionTuning, SfmViews
+from hdr_nsff.priors.poses.view_matches import EarlierRounds
 
 LENS = Lens(posed_clips.K, (0.15, 0.0, 0.0, 0.0), posed_clips.W, posed_clips.H)
 
@@ -79,6 +81,22 @@ def test_a_lens_whose_model_fits_worse_than_the_pinholes_is_none(tmp_path, clip)
         for choice in ("auto", "none")
     )
     assert not searched.lenses and np.array_equal(searched.c2w, plain.c2w)
+
+
+@pytest.mark.parametrize("lens", [(0.15, 0.0), "auto"])
+def test_a_camera_with_a_lens_that_does_not_register_is_named(tmp_path, clip, monkeypatch, lens):
+    camera = ColmapCamera("RADIAL", posed_clips.W, posed_clips.H, posed_clips.K, np.zeros(2))
+    nothing = np.zeros(0)
+    image = ColmapImage("00000.png", 1, np.eye(4)[:3], np.zeros((0, 2)), nothing)
+    model = ColmapModel({1: camera}, {1: image}, nothing, np.zeros((0, 3)), nothing, nothing)
+    views = SfmViews(clip[:2], np.zeros(clip.shape[:3], bool)[:2], [[0], [1]], np.arange(2))
+    tuning = ReconstructionTuning()
+    mapper = Mapper(views, tmp_path, 1, "sift", tuning, CPU, EarlierRounds())
+    fit = sfm.LensFit({1: (posed_clips.FOCAL, 0.15, 0.0)}, model_error_px=1.0, error_px=0.5)
+    monkeypatch.setattr(Mapper, "model", lambda *_: (model, 1))
+    monkeypatch.setattr("hdr_nsff.priors.poses.mapper.lens_fit", lambda *_: fit)
+    with pytest.raises(InputError, match="none of the frames of one camera could be registered"):
+        mapper.poses(lens)
 
 
 @pytest.mark.parametrize(

@@ -83,8 +83,9 @@ class Mapper:
             try:
                 poses = self.bent_poses(bent[0], limit)
             except InputError:  # the lens that fits the model of a pinhole has to do
+                poses = self.of_model(model, scale)
                 lenses = self.lenses(model, lambda camera: fitted_lens(fit, model, camera))
-                poses = replace(self.of_model(model, scale), lenses=lenses)
+                poses = replace(poses, lenses=lenses)
             if poses.lenses:
                 return poses
         return self.of_model(model, scale)
@@ -99,8 +100,8 @@ class Mapper:
         model, scale = self.model(mapping, round_of_its_own)
         fit = lens_fit(round_of_its_own)
         tuning = self.tuning.lens
-        lenses = self.lenses(model, lambda camera: lens_of(model, camera, fit, tuning))
         poses = self.of_model(model, scale)
+        lenses = self.lenses(model, lambda camera: lens_of(model, camera, fit, tuning))
         largest = max(lens.max_displacement_px() for lens in lenses.values())
         bends = largest >= tuning.min_displacement_px or not mapping.refine
         fits = median_error(model, self.tuning) <= max_error_px
@@ -152,7 +153,9 @@ class Mapper:
         return best_readout(error)
 
     def lenses(self, model: ColmapModel, of_camera: Callable[[int], Lens]) -> dict[int, Lens]:
-        """The lens of each group of views, of the size of the frames."""
+        """The lens of each group of views, of the size of the frames; every group has a
+        view in the model, as `of_model` makes sure.
+        """
         height, width = self.views.images.shape[1:3]
         image_of = views_of_images(model)
         lenses = {}
