@@ -2,11 +2,13 @@
 nothing.
 """
 
+from itertools import product
+
 import numpy as np
 import pytest
 
 from hdr_nsff.geometry.lens import Lens, distorted_picture, undistorted_picture
-from hdr_nsff.geometry.pinhole import intrinsics, pixel_centers
+from hdr_nsff.geometry.pinhole import camera_rays, intrinsics, pixel_centers
 
 W, H = 96, 64
 K = intrinsics(80.0, W, H)
@@ -21,6 +23,22 @@ def test_undistorting_is_the_inverse_of_distorting(lens):
     there = lens.distort(pixels, lens.pinhole())
     assert np.abs(lens.undistort(there, lens.pinhole()) - pixels).max() < 1e-5
     assert np.abs(there - pixels).max() > 1
+
+
+def test_every_lens_that_is_one_to_one_is_undistorted_as_far_as_it_records():
+    centers, accepted = pixel_centers(9, 16), 0
+    numbers = product((40, 80, 108), np.linspace(-0.3, 0.3, 11), np.linspace(-0.1, 0.1, 5))
+    for fov, k1, k2 in numbers:
+        pinhole = intrinsics(8 / np.tan(np.radians(fov / 2)), 16, 9)
+        lens = Lens(pinhole, (k1, k2, 0.0, 0.0), 16, 9)
+        if lens.is_one_to_one():
+            accepted += 1
+            seen = lens.undistort(centers, pinhole)
+            missed = np.linalg.norm(lens.distort(seen, pinhole) - centers, axis=-1) > 1e-6
+            radius = np.linalg.norm(camera_rays(seen, pinhole)[missed, :2], axis=-1)
+            assert radius == pytest.approx(np.sqrt(lens.rising_square())), (fov, k1, k2)
+            assert missed.sum() <= 4  # corners that nothing is recorded in
+    assert accepted > 80
 
 
 def test_distortion_is_that_of_opencv_to_the_digit():

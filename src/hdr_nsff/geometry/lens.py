@@ -20,7 +20,7 @@ import numpy as np
 
 from hdr_nsff.geometry import pinhole
 
-UNDISTORT_STEPS = 100  # of the fixed-point iteration, which ends earlier where it converges
+UNDISTORT_STEPS = 50  # of Newton's method, which ends earlier where it converges
 UNDISTORT_ERROR = 1e-9  # image plane at depth 1
 ZOOM_RANGE = (0.25, 4.0)  # of focal lengths that are tried for an undistorted picture
 ZOOM_STEPS = 40  # of bisection
@@ -61,16 +61,34 @@ class Lens:
 
     def undistort(self, pixels: np.ndarray, K: np.ndarray) -> np.ndarray:
         """Where a pinhole camera `K` (3, 3) sees (..., 2) what the lens recorded at
-        `pixels` (..., 2).
+        `pixels` (..., 2), by Newton's method. Where the lens records nothing, that is
+        the farthest that it does record.
         """
         recorded = pinhole.camera_rays(pixels, self.K)[..., :2]
-        plane = recorded
+        plane, limit = recorded, np.sqrt(self.rising_square())
         for _ in range(UNDISTORT_STEPS):
             error = recorded - self.bend(plane)
-            plane = plane + error
+            plane = plane + self.newton_step(plane, error)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                plane = plane * np.fmin(1, limit / np.linalg.norm(plane, axis=-1, keepdims=True))
             if not (np.abs(error).max(initial=0) > UNDISTORT_ERROR):
                 break
         return pinhole.to_pixels(pinhole.homogeneous(plane), K)
+
+    def newton_step(self, plane: np.ndarray, error: np.ndarray) -> np.ndarray:
+        """By how much (..., 2) points of the image plane have to move for the lens to
+        bring them farther by `error` (..., 2), to the first order.
+        """
+        x, y = plane[..., 0], plane[..., 1]
+        k1, k2, p1, p2 = self.distortion
+        with np.errstate(all="ignore"):  # a model that no lens has
+            r2 = x * x + y * y
+            radial, slope = 1 + k1 * r2 + k2 * r2 * r2, 2 * k1 + 4 * k2 * r2
+            xx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x  # d bent_x / d x
+            xy = slope * x * y + 2 * p1 * x + 2 * p2 * y
+            yy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+            inverse = np.stack([yy, -xy, -xy, xx], -1) / (xx * yy - xy * xy)[..., None]
+        return np.einsum("...ij,...j->...i", inverse.reshape(*plane.shape, 2), error)
 
     def undistorted_pixels(self) -> np.ndarray:
         """Where the camera `pinhole()` sees (H, W, 2) what the pixels recorded."""
@@ -124,11 +142,23 @@ class Lens:
 
     def is_one_to_one(self) -> bool:
         """Whether pixels further out see further out, up to the corners."""
+        # squared radius before a barrel lens, over that where it is recorded
+        needed = 2.0 if self.distortion[0] < 0 else 1.0
+        return self.rising_square() >= needed * self.border_square()
+
+    def border_square(self) -> float:
+        """The largest squared radius of recorded pixels on the image plane."""
+        return float((pinhole.camera_rays(self.border(), self.K)[..., :2] ** 2).sum(-1).max())
+
+    def rising_square(self) -> float:
+        """Up to which squared radius of the image plane points further out are recorded
+        further out; at most four times that of the corners.
+        """
         k1, k2, _, _ = self.distortion
-        r2 = (pinhole.camera_rays(self.border(), self.K)[..., :2] ** 2).sum(-1).max()
-        # what a barrel lens brings to the recorded border lies up to twice as far out
-        squares = np.linspace(0, 2 * r2 if k1 < 0 else r2, BORDER_POINTS)
-        return bool((1 + 3 * k1 * squares + 5 * k2 * squares**2 > 0).all())
+        r2 = self.border_square()
+        squares = np.linspace(0, 4 * r2, 257)  # r2 and 2 r2 are among them
+        rises = np.logical_and.accumulate(1 + 3 * k1 * squares + 5 * k2 * squares**2 > 0)
+        return float(squares[rises].max())
 
 
 def zoomed(K: np.ndarray, zoom: float) -> np.ndarray:

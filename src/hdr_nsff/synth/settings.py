@@ -199,7 +199,8 @@ def parse_lens(text: str, K: np.ndarray, size: tuple[int, int]) -> Lens | None:
     sides = np.array(size)
     outline = lens.undistort(lens.border(), K)
     in_view = (np.abs(outline - sides / 2) < LENS_MARGIN * sides / 2).all()
-    if len(more) > 1 or not (in_view and lens.is_one_to_one()):
+    recorded = np.allclose(lens.distort(outline, K), lens.border(), atol=1e-3)
+    if len(more) > 1 or not (in_view and recorded and lens.is_one_to_one()):
         raise InputError(
             f"--lens {text!r:.40}: too strong for these pictures, or not k1,k2; "
             "choose a k1 from -0.3 to 0.3"
