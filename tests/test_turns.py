@@ -7,7 +7,9 @@ from test_prepare_footage import work_on
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.footage.turns import TurnsTuning, find_cameras_in_turn, is_period
+from hdr_nsff.prepare.prepare import prepare
 from hdr_nsff.prepare.steps.footage import exposure_step
+from hdr_nsff.prepare.work import PrepareConfig
 
 CAMERAS = sliding(PLACES[::2])  # four of them
 
@@ -60,4 +62,15 @@ def test_the_user_may_say_that_there_is_no_rig(tmp_path):
 def test_a_rig_of_more_cameras_than_frames_show_twice_is_refused(tmp_path):
     work = work_on(tmp_path, in_turn(2), rig=5)
     with pytest.raises(InputError, match="only 8 frames; each camera needs at least two"):
+        exposure_step(work)
+
+
+def test_numbers_of_a_lens_are_refused_for_cameras_in_turn(tmp_path):
+    refused = "-0.3,0.05: 4 cameras take the frames in turn, and numbers"
+    given = PrepareConfig(tmp_path, tmp_path / "scene", rig=4, lens_distortion="-0.3,0.05")
+    with pytest.raises(InputError, match=refused):
+        prepare(given)
+    assert not given.out.exists()
+    work = work_on(tmp_path / "found", in_turn(3), lens_distortion="-0.3,0.05")
+    with pytest.raises(InputError, match=refused):
         exposure_step(work)

@@ -69,6 +69,19 @@ def parse_lens(text: str) -> LensChoice | Path:
     return (k1, k2)
 
 
+def check_lens_in_turn(config: PrepareConfig, cameras: int) -> None:
+    """InputError where numbers are given that nothing would use: frames that `cameras`
+    take in turn are mapped as recorded, unless poses bring a focal length.
+    """
+    choice = parse_lens(config.lens_distortion)
+    if cameras > 1 and config.poses is None and isinstance(choice, tuple) and any(choice):
+        raise InputError(
+            f"--lens-distortion {config.lens_distortion}: {cameras} cameras take the frames in "
+            "turn, and numbers without a focal length do not undistort these; give the file of a "
+            "calibration, or --rig 1 where it is one camera"
+        )
+
+
 def known_lenses(found: Manifest, config: PrepareConfig) -> dict[int, LensEntry]:
     """The lenses of a scene folder that the settings let stand."""
     choice = parse_lens(config.lens_distortion)

@@ -40,7 +40,7 @@ from hdr_nsff.prepare.cut_parts import (
     with_exposures_of,
 )
 from hdr_nsff.prepare.engine import found_manifest
-from hdr_nsff.prepare.lens import given_lenses, known_lenses, parse_lens
+from hdr_nsff.prepare.lens import check_lens_in_turn, given_lenses, known_lenses
 from hdr_nsff.prepare.segments import CLIP_FOLDER, check_segments, prepare_segments
 from hdr_nsff.prepare.steps.footage import MIN_FRAMES, ClipCutsError, check_count
 from hdr_nsff.prepare.steps.neural import check_networks
@@ -221,7 +221,7 @@ def check_settings(config: PrepareConfig) -> None:
             "training; leave one out"
         )
     parse_exposures(config.exposures, config.ev)
-    parse_lens(config.lens_distortion)
+    check_lens_in_turn(config, config.rig or 1)
     if config.readout != "auto" and not 0 <= config.readout <= MAX_READOUT_MS:
         raise InputError(
             f"--readout {config.readout:g}: give the milliseconds from a rolling shutter's first "

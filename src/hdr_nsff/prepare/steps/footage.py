@@ -20,7 +20,7 @@ from hdr_nsff.footage.turns import find_cameras_in_turn
 from hdr_nsff.prepare.exposure_times import exposure_times
 from hdr_nsff.prepare.exposures import frame_exposures
 from hdr_nsff.prepare.length import offered_segments
-from hdr_nsff.prepare.lens import describe, undistorted
+from hdr_nsff.prepare.lens import check_lens_in_turn, describe, undistorted
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.times import (
     by_timestamps,
@@ -198,6 +198,7 @@ def exposure_step(work: Work) -> StepResult:
         frame.split = "test" if frame.index in held_out else "train"
     work.forget(("equalized",))
     m.rig = cameras_in_turn(work)
+    check_lens_in_turn(work.config, m.rig)
     if m.rig == 1:
         check_cuts(work)
     cycle = "no alternation"
