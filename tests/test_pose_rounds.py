@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from posed_clips import H, W, panning
 
+from hdr_nsff.core.errors import InputError
 from hdr_nsff.geometry.poses import Poses
 from hdr_nsff.prepare.steps import poses as step
 
@@ -32,17 +33,24 @@ def models() -> list[dict[str, bytes]]:
 @pytest.fixture
 def rounds(tmp_path, monkeypatch, models):
     """Runs the rounds on a pan whose structure from motion is said to find parallax,
-    and of which rotations explain a `share`; the masks of every round are given.
+    and of which rotations explain a `share`; the masks of every round are given, and
+    round `fails`, counted from 1, fails.
     """
 
     def run(
-        share: float | None, *masks: np.ndarray, video: np.ndarray = PAN, cameras: int = 1
+        share: float | None,
+        *masks: np.ndarray,
+        video: np.ndarray = PAN,
+        cameras: int = 1,
+        fails: int | None = None,
     ) -> tuple[Poses, int]:
         estimates = []
 
         def estimate(work, moving, earlier):
             estimates.append(moving)
             models.append(dict(earlier.model))
+            if len(estimates) == fails:
+                raise InputError("poses failed: 7 of 8 frames; film slower")
             earlier.model = {"images.bin": bytes([len(models), 0, 255])}
             return PLACED
 
@@ -104,6 +112,22 @@ def test_restless_masks_alone_do_not(rounds, share):
     poses, estimates = rounds(share, *RESTLESS)
     assert poses.parallax == "full" and estimates == 3
     assert "in doubt" in poses.notes[-1] and "--tripod" in poses.notes[-1]
+
+
+@pytest.mark.parametrize("fails", [2, 3])
+def test_a_later_round_that_fails_leaves_the_poses_of_the_one_before(rounds, capsys, fails):
+    poses, estimates = rounds(0.7, *RESTLESS, fails=fails)
+    assert poses.parallax == "full" and poses.registered.all() and estimates == fails
+    (note,) = poses.notes
+    assert note.startswith("in doubt: the next round failed with masks from these: poses failed")
+    assert "7 of 8 frames; give --tripod" in note and note in " ".join(
+        capsys.readouterr().err.split()
+    )
+
+
+def test_a_first_round_that_fails_is_an_error(rounds):
+    with pytest.raises(InputError, match="7 of 8 frames"):
+        rounds(0.7, *RESTLESS, fails=1)
 
 
 def test_masks_that_nearly_settle_are_in_no_doubt(rounds):

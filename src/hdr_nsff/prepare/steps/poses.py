@@ -167,7 +167,8 @@ def poses_and_masks(work: Work) -> Poses:
     change any more. Where they keep changing and rotations explain much of the
     footage, the camera counts as one that turns in place; where the little detail that
     is no mover's keeps its place, as one that stands still; else a note says that they
-    are in doubt. A rig needs one round: its masks need no poses.
+    are in doubt, as where a later round fails. A rig needs one round: its masks need no
+    poses.
     """
     if work.manifest.rig > 1:
         return estimate(work, work.visits.moving)
@@ -193,19 +194,28 @@ def poses_and_masks(work: Work) -> Poses:
         if settled:
             return poses
         if rounds_left:
-            poses, before = estimate(work, moving, earlier), moving
+            try:
+                poses, before = estimate(work, moving, earlier), moving
+            except InputError as error:
+                reason, *_ = str(error).split(";")
+                return in_doubt(poses, f"the next round failed with masks from these: {reason}")
     without_parallax = poses_without_parallax(work, before, moving)
     if without_parallax is not None:
         return without_parallax
     if agreement < MIN_TRUSTED_IOU and is_restless(before, moving):
-        note = (
-            f"in doubt: after {MAX_ROUNDS + 1} rounds masks still agree to {agreement:.0%} only; "
-            "give --tripod if the camera stands still, else poses (--poses PATH) or masks "
-            "(--mask FOLDER)"
-        )
-        say(f"poses: {note}")
-        return replace(poses, notes=(*poses.notes, note))
+        rounds = MAX_ROUNDS + 1
+        return in_doubt(poses, f"after {rounds} rounds masks still agree to {agreement:.0%} only")
     return poses
+
+
+def in_doubt(poses: Poses, reason: str) -> Poses:
+    """The same poses with a note, also printed, that they are in doubt, and why."""
+    note = (
+        f"in doubt: {reason}; give --tripod if the camera stands still, else poses "
+        "(--poses PATH) or masks (--mask FOLDER)"
+    )
+    say(f"poses: {note}")
+    return replace(poses, notes=(*poses.notes, note))
 
 
 def is_restless(before: np.ndarray, moving: np.ndarray) -> bool:
