@@ -20,7 +20,7 @@ from hdr_nsff.core.io import FULL
 from hdr_nsff.footage.colmap import read_model
 from hdr_nsff.priors.poses import sfm
 from hdr_nsff.priors.poses.colmap_matches import MIN_PAIRS_OF_PROCESS
-from hdr_nsff.priors.poses.reconstruct import attempts
+from hdr_nsff.priors.poses.reconstruct import SfmViews, attempts, failure_message
 from hdr_nsff.priors.poses.rotation import focal_length
 from hdr_nsff.priors.poses.sfm_worker import LOST_PX, drop_lost_points, mean_error
 from hdr_nsff.priors.poses.trimming import TrimmingTuning
@@ -33,6 +33,18 @@ def test_a_worker_that_crashes_reports_why(tmp_path):
     job = sfm.Job(str(tmp_path), [["missing.png"]], [], 100.0, "nonsense")  # type: ignore[arg-type]
     with pytest.raises(sfm.SfmError):
         sfm.run_worker(job)
+
+
+def test_a_worker_that_was_killed_says_that_memory_may_be_short(tmp_path, monkeypatch):
+    (tmp_path / "killed.py").write_text("import os, signal; os.kill(os.getpid(), signal.SIGKILL)")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *sys.path]))
+    monkeypatch.setattr(sfm, "WORKER", "killed")
+    with pytest.raises(sfm.SfmError, match="was killed, probably because memory") as killed:
+        sfm.run_worker(sfm.Job(str(tmp_path), [], [], 1.0, "global"))
+    views = SfmViews(np.zeros((2, 8, 8, 3)), np.zeros((2, 8, 8), bool), [[0, 1]], np.arange(2))
+    message = failure_message(None, views, [str(killed.value)])
+    assert message.startswith("poses failed: its process was killed") and "--max-size" in message
+    assert "texture" not in message
 
 
 def test_a_worker_does_not_outlive_its_parent(tmp_path):

@@ -234,9 +234,8 @@ def best_model(
                 earlier.model = {p.name: p.read_bytes() for p in files.iterdir()}
                 return model, scale
     best = search.best
-    if best is None or not has_plausible_lens(best, tuning):
-        raise InputError(failure_message(best, views, search.failures, tuning))
-    if len(best.images) < tuning.min_registered * search.count:
+    least = tuning.min_registered * search.count
+    if best is None or len(best.images) < least or not has_plausible_lens(best, tuning):
         raise InputError(failure_message(best, views, search.failures, tuning))
     return best, scale
 
@@ -425,11 +424,12 @@ def failure_message(
     count, (height, width) = len(views.of_frame), views.images.shape[1:3]
     advice = ADVICE if len(views.groups) == 1 else RIG_ADVICE
     if model is None:
-        last_error = f"; the last error was: {failures[-1]}" if failures else ""
-        return (
-            "poses failed: no two frames could be matched "
-            f"(no common texture seen from two places){last_error}; {advice}"
-        )
+        reason = "no two frames could be matched (no common texture seen from two places)"
+        if sfm.KILLED in failures:
+            reason, advice = sfm.KILLED, "give a smaller --max-size, or fewer frames (--stride)"
+        elif failures:
+            reason += f"; the last error was: {failures[-1]}"
+        return f"poses failed: {reason}; {advice}"
     registered = views_of_images(model)
     missing = [t for t in range(count) if int(views.of_frame[t]) not in registered]
     if len(missing) <= (1 - tuning.min_registered) * count:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -34,6 +35,7 @@ WORKER = "hdr_nsff.priors.poses.sfm_worker"
 MATCHES_FILE = "matches.npz"
 MIN_FREE_BYTES = 2**20  # a disk with less free space is full
 DISK_FULL_WORDS = ("No space left", "disk is full")
+KILLED = "its process was killed, probably because memory did not suffice"
 
 
 @dataclass(frozen=True)
@@ -173,6 +175,8 @@ class Worker:
         code = self.process.wait()
         self.end()
         check_free_space(Path(self.job.folder), " ".join(self.error_lines))
+        if code == -signal.SIGKILL:
+            raise SfmError(KILLED)
         if code != 0:
             messages = [line.strip() for line in self.error_lines if line.strip()]
             raise SfmError(messages[-1] if messages else f"pycolmap ended with code {code}")
