@@ -47,6 +47,16 @@ def test_a_worker_that_was_killed_says_that_memory_may_be_short(tmp_path, monkey
     assert "texture" not in message
 
 
+def test_a_worker_reads_no_module_from_the_current_folder(tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here/random.py").write_text("raise SystemExit('the script of a user')")
+    (tmp_path / "worker.py").write_text("import random; random.random()")
+    monkeypatch.chdir(tmp_path / "here")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr(sfm, "WORKER", "worker")
+    sfm.run_worker(sfm.Job(str(tmp_path), [], [], 1.0, "global"))
+
+
 def test_a_worker_does_not_outlive_its_parent(tmp_path):
     code = (
         "import subprocess, sys, time\n"

@@ -245,7 +245,7 @@ def import_faults(modules: Iterable[str]) -> dict[str, str | None]:
 
 def import_fault(module: str) -> str | None:
     """Why a module cannot be imported; None where it can."""
-    command = [sys.executable, "-c", f"import {module}"]
+    command = [sys.executable, "-P", "-c", f"import {module}"]
     try:
         ended = subprocess.run(
             command, capture_output=True, text=True, errors="replace", timeout=IMPORT_SECONDS

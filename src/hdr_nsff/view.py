@@ -63,7 +63,7 @@ def viewer_beside(run: Path) -> Iterator[None]:
     """
     code = "from hdr_nsff.cli import main; main()"
     arguments = ["view", str(run), "--wait", "--device", "cpu"]
-    viewer = subprocess.Popen([sys.executable, "-c", code, *arguments])
+    viewer = subprocess.Popen([sys.executable, "-P", "-c", code, *arguments])
     try:
         yield
     finally:

@@ -22,7 +22,7 @@ THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_
 POLL_S = 0.2  # seconds between looks at the processes
 PROGRESS_S = 2.0  # seconds between looks at their progress
 GRACE_S = 5.0  # seconds that a process has to end by itself
-COMMAND = (sys.executable, "-c", "from hdr_nsff.cli import main; main()")
+COMMAND = (sys.executable, "-P", "-c", "from hdr_nsff.cli import main; main()")
 
 Environment = dict[str, str]
 

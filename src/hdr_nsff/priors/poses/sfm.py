@@ -140,8 +140,8 @@ class Worker:
         self.job = job
         file = job.out.with_suffix(".json")
         file.write_text(json.dumps(asdict(job)))
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", WORKER, str(file)],
+        self.process = subprocess.Popen(  # -P: no module is read from the current folder
+            [sys.executable, "-P", "-m", WORKER, str(file)],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, errors="replace",
         )  # fmt: skip
         # read at once, so that a worker need not wait for others to be shown; errors in
