@@ -10,6 +10,7 @@ from hdr_nsff.priors.poses.rotation import (
     default_focal,
     field_of_view,
     fit_panorama,
+    max_displacement,
     rotation_share,
     rotation_up_to_scale,
 )
@@ -72,6 +73,23 @@ def test_the_default_field_of_view_is_across_the_longer_side(width: int, height:
     assert panorama is not None and not panorama.focal_known and panorama.focal == focal
     assert not panorama.long_lens
     assert field_of_view(focal, width, height) == pytest.approx(60)
+
+
+def pan(degrees: float) -> np.ndarray:
+    """The rotations of a camera that turns by so much, the middle one of which is 1."""
+    angles = np.linspace(-degrees / 2, degrees / 2, 41)[:, None]
+    return Rotation.from_euler("y", angles, degrees=True).as_matrix()
+
+
+def test_the_displacement_of_a_pan_is_in_pixels_that_pictures_may_have() -> None:
+    focal = default_focal(640)  # 60 degrees
+    edge = focal * np.tan(np.radians(30 + 30)) - 320
+    assert edge < max_displacement(pan(60), focal, 640, 360) < 1.1 * edge
+    for degrees in (120, 180, 360):
+        assert 640 <= max_displacement(pan(degrees), focal, 640, 360) < 10 * 640
+    turned = np.tile(np.diag([-1.0, 1.0, -1.0]), (3, 1, 1))
+    turned[1] = np.eye(3)
+    assert max_displacement(turned, focal, 640, 360) == 640  # all of it is behind the camera
 
 
 def test_random_matches_give_no_panorama():

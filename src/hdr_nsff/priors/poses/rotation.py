@@ -34,6 +34,7 @@ from hdr_nsff.priors.poses.rotation_adjustment import (
 
 MAX_RANSAC_STEPS = 2000
 RANSAC_CONFIDENCE = 0.999
+MIN_AHEAD = 0.1  # cosine: what is 84 degrees off the axis or more is in no picture
 ROOT_CANDIDATES = 8  # frames tried as the root of the tree of pairs
 
 
@@ -321,7 +322,8 @@ def rotation_up_to_scale(matrix: np.ndarray) -> np.ndarray:
 
 def max_displacement(rotations: np.ndarray, focal: float, width: int, height: int) -> float:
     """The farthest, in pixels, that any of `rotations` (T, 3, 3) moves the image's
-    center or a corner from its position in the middle frame.
+    center or a corner from its position in the middle frame. Where it comes to lie
+    behind the camera or almost sideways, the width of the image counts.
     """
     corners = np.array([[0, 0], [1, 1], [1, -1], [-1, 1], [-1, -1]])
     positions = corners * np.array([width, height]) / 2
@@ -329,5 +331,6 @@ def max_displacement(rotations: np.ndarray, focal: float, width: int, height: in
     sources = np.repeat(np.arange(count), len(positions))
     frames = np.stack([sources, np.full_like(sources, count // 2)], 1)
     p = np.tile(positions, (count, 1))
-    moved, _ = rotate_pixels(rotations, focal, frames, p)
-    return float(np.linalg.norm(moved - p, axis=1).max())
+    moved, directions = rotate_pixels(rotations, focal, frames, p)
+    ahead = directions[:, 2] > MIN_AHEAD * np.linalg.norm(directions, axis=1)
+    return float(np.where(ahead, np.linalg.norm(moved - p, axis=1), width).max())
