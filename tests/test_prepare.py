@@ -341,6 +341,20 @@ def test_held_out_frames_do_not_reach_training(config):
     assert all(f.disparity is None and f.moving is not None for f in scene.test)
 
 
+def test_flow_across_held_out_frames_is_estimated_where_a_folder_lacks_it(config):
+    """The public NSFF layout has flow between neighbors alone."""
+    for path in config.flow.iterdir():
+        i, j = map(int, path.stem.split("_"))
+        if abs(i - j) != 1:
+            path.unlink()
+    m = Manifest.load(prepare(replace(config, hold_out=4)))
+    assert m.steps["flow"].note.endswith("22 given, 6 estimated")
+    held_out = next(f.index for f in m.frames if f.split == "test")
+    f = m.frames[held_out - 1]
+    assert f.flow[held_out].flow.startswith("raw_flow/")
+    assert f.flow[held_out + 1].flow.startswith("refined_flow/")
+
+
 def test_depth_kinds_are_converted(config):
     prepare(replace(config, depth_kind="disparity"))
     assert (Scene.open(config.out).train[0].disparity == 2).all()

@@ -12,10 +12,11 @@ from hdr_nsff.core.io import write_half
 from hdr_nsff.core.progress import track
 from hdr_nsff.core.tensors import pick_device
 from hdr_nsff.footage.datasets import maps
+from hdr_nsff.footage.flow_files import pair_file, read_flow_files
 from hdr_nsff.prepare.lens import FlowUndistorter, flow_undistorter
 from hdr_nsff.prepare.result import StepResult
-from hdr_nsff.prepare.work import Work
-from hdr_nsff.priors.flow.sources import fallback_note, flow_source, resolve_source
+from hdr_nsff.prepare.work import PrepareConfig, Work
+from hdr_nsff.priors.flow.sources import FlowName, fallback_note, flow_source, resolve_source
 from hdr_nsff.scene.manifest import FlowFiles, FrameEntry, Manifest
 
 FLOW_CHUNK = 8  # pairs between two savings
@@ -35,36 +36,45 @@ def find_flow(work: Work) -> StepResult:
     names = {pair: flow_files("raw_flow", pair) for pair in pairs}
     missing = [pair for pair in pairs if not stored(work, names[pair])]
     given = store_given_flow(work, names, undistorted)
-    missing = [pair for pair in missing if pair not in given]
-    from_folder = isinstance(c.flow, Path)
-    neighbors, equal = learning_pairs(m.frames)
-    device = pick_device(c.device)
-    source = flow_source(c.flow, c.flow_weights, c.semantic, neighbors, equal, device=device)
-    size = max(len(missing), 1) if from_folder else FLOW_CHUNK
-    chunks = [missing[k : k + size] for k in range(0, len(missing), size)]
-    for chunk in track(chunks, "flow"):
-        found, valid = source(*work.equalized, np.array(chunk))
-        for pair, f, v in zip(chunk, found, valid, strict=True):
-            if from_folder:
-                f, v = undistorted(m.frames[pair[0]].camera_id, f, v)
-            write_flow(work, names[pair], f, v)
+    estimate_flow(work, names, [pair for pair in missing if pair not in given])
     share = float(np.mean([read_mask(work.folder / n.valid).mean() for n in names.values()]))
-    num_given = len(pairs) if from_folder else len(given)
-    name = (
-        "data set" if len(given) == len(pairs) else str(resolve_source(c.flow, c.semantic.features))
-    )
-    fallback = "" if len(given) == len(pairs) else fallback_note(c.flow, c.semantic.features)
+    num_given = len(given)
+    all_given = num_given == len(pairs)
+    giver = str(c.flow) if isinstance(c.flow, Path) else "data set"
+    chosen = estimator(c), c.semantic.features
+    name = giver if all_given else str(resolve_source(*chosen))
+    fallback = "" if all_given else fallback_note(*chosen)
     note = f"{len(pairs)} pairs ({name}{fallback})"
     note += f", {share:.0%} of the pixels pass the forward-backward check"
     if 0 < num_given < len(pairs):
         note += f"; {num_given} given, {len(pairs) - num_given} estimated"
     by_frame = {f.index: {j: names[i, j] for i, j in pairs if i == f.index} for f in m.frames}
     return StepResult(
-        provenance="given" if num_given == len(pairs) else "estimated",
+        provenance="given" if all_given else "estimated",
         note=note,
         details={"valid_share": round(share, 4), "source": name},
         frames={"raw_flow": by_frame, "flow": by_frame},
     )
+
+
+def estimate_flow(work: Work, names: dict[Pair, FlowFiles], pairs: list[Pair]) -> None:
+    """Estimate and write the flow of these pairs."""
+    if not pairs:
+        return
+    c = work.config
+    learned = learning_pairs(work.manifest.frames)
+    device = pick_device(c.device)
+    source = flow_source(estimator(c), c.flow_weights, c.semantic, *learned, device=device)
+    chunks = [pairs[k : k + FLOW_CHUNK] for k in range(0, len(pairs), FLOW_CHUNK)]
+    for chunk in track(chunks, "flow"):
+        found, valid = source(*work.equalized, np.array(chunk))
+        for pair, f, v in zip(chunk, found, valid, strict=True):
+            write_flow(work, names[pair], f, v)
+
+
+def estimator(config: PrepareConfig) -> FlowName | None:
+    """The source that estimates flow: the default where a folder lacks some."""
+    return None if isinstance(config.flow, Path) else config.flow
 
 
 def flow_files(folder: str, pair: Pair) -> FlowFiles:
@@ -128,8 +138,18 @@ def learning_pairs(frames: list[FrameEntry]) -> tuple[list[Pair], list[Pair]]:
 def store_given_flow(
     work: Work, names: dict[Pair, FlowFiles], undistorted: FlowUndistorter
 ) -> set[Pair]:
-    """Write the flow that a data set gives, `undistorted`; the pairs it gives."""
-    m = work.manifest
+    """Write the flow that the user or a data set gives, `undistorted`; the pairs they
+    give.
+    """
+    m, size = work.manifest, (work.manifest.height, work.manifest.width)
+    if isinstance(work.config.flow, Path):
+        given = pairs_of_folder(work.config.flow, m.frames, list(names))
+        missing = [pair for pair in given if not stored(work, names[pair])]
+        flows = read_flow_files(work.config.flow, missing, size)
+        for pair, flow, valid in zip(missing, *flows, strict=True):
+            camera_id = m.frames[pair[0]].camera_id
+            write_flow(work, names[pair], *undistorted(camera_id, flow, valid))
+        return set(given)
     found: set[Pair] = set()
     if work.capture_with("flow") is None:
         return found
@@ -139,18 +159,34 @@ def store_given_flow(
             continue
         found.add((i, j))
         if not stored(work, files):
-            flow, valid = maps.flow_map(path, (m.height, m.width))
+            flow, valid = maps.flow_map(path, size)
             write_flow(work, files, *undistorted(m.frames[i].camera_id, flow, valid))
     return found
+
+
+def pairs_of_folder(folder: Path, frames: list[FrameEntry], pairs: list[Pair]) -> list[Pair]:
+    """The pairs that the user's folder gives: all neighbors in the clip, and those
+    across held-out frames that it holds.
+    """
+    return [p for p in pairs if pair_file(folder, *p) or not is_across_held_out(frames, p)]
+
+
+def is_across_held_out(frames: list[FrameEntry], pair: Pair) -> bool:
+    """Whether held-out frames lie between the two of a pair."""
+    first, last = sorted(pair)
+    line = (frames[first].camera_id, frames[first].track)
+    between = frames[first + 1 : last]
+    return any(f.split == "test" and (f.camera_id, f.track) == line for f in between)
 
 
 def flow_is_given(work: Work, i: int, j: int) -> bool:
     """Whether the flow between the frames `i` and `j` is the user's or the data set's,
     one way or both.
     """
-    if isinstance(work.config.flow, Path):
-        return True
+    frames, folder = work.manifest.frames, work.config.flow
+    if isinstance(folder, Path):
+        return bool(pairs_of_folder(folder, frames, [(i, j), (j, i)]))
     if work.capture_with("flow") is None:
         return False
-    a, b = work.manifest.frames[i], work.manifest.frames[j]
+    a, b = frames[i], frames[j]
     return b.source in work.picture(a).flow or a.source in work.picture(b).flow
