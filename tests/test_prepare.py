@@ -411,23 +411,40 @@ def test_steps_depend_only_on_steps_before_them():
         assert all(order.index(n) < order.index(name) for n in kind.needs)
 
 
-def test_depth_in_a_folder_tells_near_and_far_where_poses_do_not(config, tmp_path):
-    bounds = np.load(config.poses)
-    known = Manifest.load(prepare(config))
-    assert (known.near, known.far) == (0.8, 5)  # of the poses, with room
+def poses_without_range(bounds: Path, path: Path) -> Path:
+    """The poses of `given` as a `transforms.json`, which tells no near and far."""
     transforms = {"w": W, "h": H, "fl_x": FOCAL, "fl_y": FOCAL, "cx": W / 2, "cy": H / 2}
     transforms["frames"] = []
-    for t in range(COUNT):
+    for t, row in enumerate(np.load(bounds)):
         pose = np.eye(4)
-        pose[0, 3] = bounds[t, 3]
+        pose[0, 3] = row[3]
         frame = {"file_path": f"{t:03d}.png", "transform_matrix": pose.tolist()}
         transforms["frames"].append(frame)
+    path.write_text(json.dumps(transforms))
+    return path
+
+
+def test_depth_in_a_folder_tells_near_and_far_where_poses_do_not(config, tmp_path):
+    known = Manifest.load(prepare(config))
+    assert (known.near, known.far) == (0.8, 5)  # of the poses, with room
+    for t in range(COUNT):
         write_npy(tmp_path / f"far/{t:03d}.npy", np.full((H, W), 8.0, np.float32))
-    (tmp_path / "transforms.json").write_text(json.dumps(transforms))
-    poses = tmp_path / "transforms.json"
+    poses = poses_without_range(config.poses, tmp_path / "transforms.json")
     far = replace(config, poses=poses, depth=tmp_path / "far", out=tmp_path / "other")
     m = Manifest.load(prepare(far))
     assert 4 < m.near < 8 < m.far < 16
+
+
+def test_flow_tells_near_and_far_where_neither_poses_nor_relative_depth_do(config, tmp_path):
+    """The wall is at z = 2."""
+    poses = poses_without_range(config.poses, tmp_path / "transforms.json")
+    relative = replace(config, poses=poses, depth_kind="relative")
+    m = Manifest.load(prepare(relative))
+    assert 1 < m.near < 2 < m.far < 4 and m.depth_kind == "relative"
+    for path in config.flow.iterdir():
+        write_npy(path, np.zeros((H, W, 2), np.float32))
+    with pytest.raises(InputError, match="too little parallax"):
+        prepare(replace(relative, redo=("flow",)))
 
 
 @pytest.mark.parametrize("tripod", [False, True])

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.distance import pdist
 
+from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.progress import say
 from hdr_nsff.core.stack import ArrayStack, Stack, by_key, spread_frames
 from hdr_nsff.footage.datasets import maps
@@ -23,7 +24,8 @@ from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.steps.neural import network_depth
 from hdr_nsff.prepare.still_cameras import still_cameras
 from hdr_nsff.prepare.work import Work
-from hdr_nsff.priors.depth.geometric import depth_range, static_geometric_depth
+from hdr_nsff.priors.depth.geometric import DepthTuning, depth_range, static_geometric_depth
+from hdr_nsff.priors.depth.parallax import disparity_range, triangulate
 from hdr_nsff.priors.masks.visits import without_movers
 from hdr_nsff.scene.manifest import Manifest
 from hdr_nsff.scene.posed_video import PosedVideo
@@ -155,11 +157,7 @@ def data_set_depth(work: Work) -> Depth:
     disparity, confidence = (
         undistorted_maps(work, work.train, values) for values in (disparity, confidence)
     )
-    changes: dict[str, Any] = {}
-    if capture.depth_kind == "relative":
-        changes["depth_kind"] = "relative"
-    elif capture.poses is not None and capture.poses.near is None:
-        changes["near"], changes["far"] = depth_range(disparity, confidence)
+    changes = changes_of(work, capture.depth_kind == "relative", disparity, confidence)
     note = "; ".join(part for part in (f"given ({capture.depth_kind})", how) if part)
     return Depth(disparity, confidence, note, "given", given=True, manifest=changes)
 
@@ -173,11 +171,7 @@ def user_depth(work: Work, folder: Path) -> Depth:
     disparity, confidence = (
         undistorted_maps(work, work.train, values[index]) for values in (disparity, confidence)
     )
-    changes: dict[str, Any] = {}
-    if kind == "relative":
-        changes["depth_kind"] = "relative"
-    elif not m.steps["poses"].details.get("known_range", True):
-        changes["near"], changes["far"] = depth_range(disparity, confidence)
+    changes = changes_of(work, kind == "relative", disparity, confidence)
     return Depth(
         disparity,
         confidence,
@@ -186,6 +180,38 @@ def user_depth(work: Work, folder: Path) -> Depth:
         given=True,
         manifest=changes,
     )
+
+
+def changes_of(
+    work: Work, relative: bool, disparity: np.ndarray, confidence: np.ndarray
+) -> dict[str, Any]:
+    """What given depth changes in the manifest: its kind, and near and far where the
+    poses come without.
+    """
+    m = work.manifest
+    changes: dict[str, Any] = {"depth_kind": "relative"} if relative else {}
+    if m.steps["poses"].details.get("known_range", True):
+        return changes
+    if not relative:
+        changes["near"], changes["far"] = depth_range(disparity, confidence)
+    elif m.parallax == "full":
+        changes["near"], changes["far"] = range_of_flow(work)
+    return changes
+
+
+def range_of_flow(work: Work) -> tuple[float, float]:
+    """Near and far of static points triangulated from flow, with room; InputError where
+    there are too few.
+    """
+    clip, tuning = work.training_clip(), DepthTuning()
+    points = triangulate(clip, *work.training_flows(work.raw_flows))
+    if len(points) < tuning.min_points:
+        raise InputError(
+            "depth: relative depth, poses without near and far, and too little parallax to find "
+            "these; add `near` and `far` to the poses, or give --depth-kind metric or disparity"
+        )
+    low, high = disparity_range(clip, points)
+    return 1 / high, 1 / low
 
 
 def depth_anything(work: Work) -> Depth:
