@@ -259,6 +259,22 @@ def test_a_frame_of_a_video_without_a_pose_lies_between_those_of_its_camera(tmp_
     assert np.allclose(poses.c2w[1, :, 3], C2W[:2, :, 3].mean(0))
 
 
+def test_a_frame_without_a_pose_has_the_focal_length_of_its_camera(tmp_path):
+    """The first frame of the second camera has none."""
+    names = [f"{camera}/{t}.png" for camera in ("a", "b") for t in range(3)]
+    document = transforms()
+    frame = document["frames"][0]
+    document["frames"] = [
+        frame | {"file_path": name, "fl_x": FOCAL if name[0] == "a" else 2 * FOCAL}
+        for name in names
+        if name != "b/0.png"
+    ]
+    write(tmp_path / "transforms.json", document)
+    poses = import_poses(tmp_path, names, (H, W))
+    assert poses.registered.tolist() == [True] * 3 + [False] + [True] * 2
+    assert np.allclose(poses.K[:, 0, 0], [FOCAL] * 3 + [2 * FOCAL] * 3)
+
+
 def test_a_frame_that_colmap_left_out_lies_between_its_neighbors(tmp_path):
     colmap_text(tmp_path)
     text = (tmp_path / "images.txt").read_text().splitlines()

@@ -70,12 +70,12 @@ def import_poses(
     note = order_note(sources, rows) if given.names is None else None
     if note is not None:
         say(f"{path.name}: {note}")
-    poses = fit_poses(path, given, rows, size, lenses)
+    cameras = [camera_of(source) for source in sources]
+    poses = fit_poses(path, given, rows, size, lenses, cameras)
     if model is not None:
         poses = with_points(poses, model, rows, lenses)
     if all(row is not None for row in rows):
         return poses
-    cameras = [camera_of(source) for source in sources]
     frames_of: dict[str, list[int]] = {camera: [] for camera in cameras}
     for t, camera in enumerate(cameras):
         frames_of[camera].append(t)
@@ -214,16 +214,18 @@ def fit_poses(
     rows: Sequence[int | None],
     size: tuple[int, int],
     lenses: Sequence[Lens | None] = (),
+    cameras: Sequence[str] = (),
 ) -> Poses:
     """The poses `rows` (T) of `given`, for frames of `size` (height, width) that were
     freed of the distortion of `lenses` (T), or of none.
 
-    A row of None is a frame without a pose. InputError, which names `path`, for poses
-    that make no sense or are for frames of another shape.
+    A row of None is a frame without a pose; it has the intrinsics of the first other
+    one of its camera, by the names `cameras` (T), or of one camera. InputError, which
+    names `path`, for poses that make no sense or are for frames of another shape.
     """
     check_given(path, given)
-    first = next(row for row in rows if row is not None)
-    K = np.stack([scaled_intrinsics(path, given, first if r is None else r, size) for r in rows])
+    rows_of_K = known_rows(rows, cameras or [""] * len(rows))
+    K = np.stack([scaled_intrinsics(path, given, row, size) for row in rows_of_K])
     height, width = size
     pinholes = {id(lens): lens.resized(width, height).pinhole() for lens in lenses if lens}
     for t, lens in enumerate(lenses):
@@ -253,6 +255,22 @@ def fit_poses(
         far=given.far,
         notes=(f"poses given: {path.name}",),
     )
+
+
+def known_rows(rows: Sequence[int | None], cameras: Sequence[str]) -> list[int]:
+    """`rows` (T) where None is the first row of the same camera, by the names `cameras`
+    (T), else the first of all: a camera without any is refused when poses are
+    interpolated.
+    """
+    first: dict[str, int] = {}
+    for camera, row in zip(cameras, rows, strict=True):
+        if row is not None:
+            first.setdefault(camera, row)
+    any_row = next(iter(first.values()))
+    return [
+        first.get(camera, any_row) if row is None else row
+        for camera, row in zip(cameras, rows, strict=True)
+    ]
 
 
 def check_given(path: Path, given: GivenPoses) -> None:
