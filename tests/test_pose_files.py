@@ -417,6 +417,15 @@ def test_numbers_that_no_camera_has_are_one_short_sentence(tmp_path, change):
     assert len(str(error.value)) < 400
 
 
+@pytest.mark.parametrize("key", ["w", "h"])
+def test_a_principal_point_needs_the_size_of_the_pictures(tmp_path, key):
+    document = transforms(camera_angle_x=0.9)
+    for missing in ("fl_x", key):
+        del document[missing]
+    with pytest.raises(InputError, match="`cx`, `cy` without `w`, `h`"):
+        from_transforms(tmp_path / "transforms.json", document)
+
+
 @pytest.mark.filterwarnings("error")
 def test_poses_with_nan_and_inf_are_one_sentence_without_warnings(tmp_path):
     for value in (np.nan, np.inf):
@@ -441,7 +450,7 @@ def test_k3_of_a_transforms_file_becomes_part_of_k1_and_k2(tmp_path):
 
 def test_k3_needs_the_size_of_the_pictures(tmp_path):
     document = transforms(camera_angle_x=0.9, k3=0.01)
-    for key in ("fl_x", "w", "h"):
+    for key in ("fl_x", "w", "h", "cx", "cy"):
         del document[key]
     with pytest.raises(InputError, match="`k3` without `w` and `h`"):
         from_transforms(tmp_path / "transforms.json", document)

@@ -339,6 +339,8 @@ def parse_intrinsics(
     elif "camera_angle_x" in values:
         width = float(values.get("w", 1))
         height = float(values.get("h", 0))
+        if ("cx" in values and "w" not in values) or ("cy" in values and "h" not in values):
+            raise InputError(f"{path}: `cx`, `cy` without `w`, `h`, the pictures' size; add them")
         fx = width / 2 / math.tan(float(values["camera_angle_x"]) / 2)
         fy = fx
         if height and "camera_angle_y" in values:
