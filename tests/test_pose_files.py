@@ -294,6 +294,22 @@ def test_cameras_at_rest_have_no_parallax(tmp_path):
     assert import_poses(tmp_path, NAMES, (H, W)).parallax == "none"
 
 
+def test_positions_that_single_precision_cannot_hold_are_refused(tmp_path):
+    """Cameras that move by one, and one that stands still, by UTM coordinates."""
+    for moves in (True, False):
+        document = transforms()
+        for frame in document["frames"]:
+            matrix = frame["transform_matrix"]
+            x = matrix[0][3] if moves else 0.0
+            matrix[0][3], matrix[1][3] = x + 483211.4, 5446321.7
+        write(tmp_path / "transforms.json", document)
+        with pytest.raises(InputError, match="subtract an offset from all positions"):
+            import_poses(tmp_path, NAMES, (H, W))
+    document["near"] = 600.0  # from a plane
+    write(tmp_path / "transforms.json", document)
+    assert import_poses(tmp_path, NAMES, (H, W)).near == 600
+
+
 def test_a_model_holds_how_often_a_point_was_seen(tmp_path):
     colmap_binary(tmp_path / "m")
     model = read_model(tmp_path / "m")

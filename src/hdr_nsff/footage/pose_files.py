@@ -44,6 +44,9 @@ from hdr_nsff.scene.manifest import MAX_NUMBER
 MAX_ROTATION_ERROR = 1e-6
 MAX_ASPECT_ERROR = 0.02  # by which the shape of the poses' frames may differ from the frames used
 MIN_TURN = 1e-6  # entries of rotations, and centers over `near`: less is no motion
+# distance of cameras from the origin, over `near`: single precision then moves what is
+# near by half a pixel of a picture 1000 wide
+MAX_OFFSET = 1e4
 MIN_TRACKED_POINTS = 10  # from which near and far are taken from the points
 Parallax = Literal["full", "rotation", "none"]
 FRAME_OF_VIDEO = re.compile(r"#\d+$")  # ends its name
@@ -74,6 +77,7 @@ def import_poses(
     poses = fit_poses(path, given, rows, size, lenses, cameras)
     if model is not None:
         poses = with_points(poses, model, rows, lenses)
+    check_offset(path, poses)
     if all(row is not None for row in rows):
         return poses
     frames_of: dict[str, list[int]] = {camera: [] for camera in cameras}
@@ -281,6 +285,21 @@ def check_given(path: Path, given: GivenPoses) -> None:
         )
     if given.size[:, 0].min() <= 0:
         raise InputError(f"{path}: poses are for frames without width; export them again")
+
+
+def check_offset(path: Path, poses: Poses) -> None:
+    """InputError where cameras are so far from the origin that single precision loses
+    their parallax. Where `near` is not known, the extent of their path stands for it.
+    """
+    centers = poses.c2w[poses.registered, :, 3]
+    extent = float(np.linalg.norm(centers - centers[:1], axis=1).max())
+    scale = poses.near or extent or 1.0
+    offset = float(np.abs(centers).max())
+    if offset > MAX_OFFSET * scale:
+        raise InputError(
+            f"{path}: the cameras are {offset:.3g} units from the origin, so single precision "
+            "would lose their parallax; subtract an offset from all positions"
+        )
 
 
 def scaled_intrinsics(path: Path, given: GivenPoses, row: int, size: tuple[int, int]) -> np.ndarray:

@@ -12,7 +12,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import atomic, write_npy
 from hdr_nsff.core.progress import say
 from hdr_nsff.core.tensors import pick_device
-from hdr_nsff.footage.pose_files import fit_poses, import_poses, with_depth_range
+from hdr_nsff.footage.pose_files import check_offset, fit_poses, import_poses, with_depth_range
 from hdr_nsff.geometry.lens import Lens
 from hdr_nsff.geometry.poses import Poses
 from hdr_nsff.prepare.lens import DistortedFramesError, lens_to_find
@@ -117,6 +117,7 @@ def data_set_poses(work: Work) -> Poses:
     rows: list[int | None] = [capture.row[f.source] for f in m.frames]
     size = (m.height, m.width)
     poses = fit_poses(capture.root, capture.poses, rows, size, lenses_of_frames(work))
+    check_offset(capture.root, poses)
     return poses if capture.points is None else replace(poses, points=capture.points)
 
 
