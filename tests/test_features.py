@@ -2,6 +2,8 @@
 published weights where they are found.
 """
 
+import weakref
+
 import cv2
 import numpy as np
 import pytest
@@ -20,6 +22,7 @@ from hdr_nsff.priors.flow.features import (
     feature_source,
     load_xfeat,
     patch_tokens,
+    run_per_frame,
     xfeat_features,
 )
 
@@ -73,6 +76,21 @@ def test_small_frames_are_doubled_so_cells_are_four_pixels():
     found = xfeat_features(XFeat(random_state()), noise(2, 48, 70, 3))
     assert found.stride == 4 and found.origin == 1
     assert found.maps.shape == (2, 64, 12, 20)  # 96 is 3 times 32, 140 becomes 160
+
+
+def test_maps_of_earlier_frames_are_not_held_a_second_time():
+    """A 640x360 clip has 33 MB of DINOv2's features a frame."""
+    made: list[weakref.ref[torch.Tensor]] = []
+
+    def network(rgb: torch.Tensor) -> torch.Tensor:
+        assert sum(maps() is not None for maps in made) <= 1
+        maps = rgb.mean(1, keepdim=True)
+        made.append(weakref.ref(maps))
+        return maps
+
+    video = noise(5, 16, 16, 3)
+    maps = run_per_frame(video, 1, 8, network, torch.device("cpu"))
+    assert len(made) == 5 and np.allclose(maps[:, 0], video.mean(-1), atol=1e-6)
 
 
 def test_features_move_with_the_frame():

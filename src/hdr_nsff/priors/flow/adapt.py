@@ -34,7 +34,7 @@ from hdr_nsff.priors.flow.correlation import (
     locate,
     sample_features,
 )
-from hdr_nsff.priors.flow.features import Features
+from hdr_nsff.priors.flow.features import Features, join_maps
 
 Refiner = Literal["small", "published"]
 
@@ -364,4 +364,5 @@ def adapt_features(clip: TrainingClip, steps: int, seed: int) -> Tensor:
     steps_per_second = steps / (time.monotonic() - begin)
     say(f"features of this clip: {steps} steps, {steps_per_second:.1f} per second")
     with torch.no_grad():
-        return torch.cat([clip.refine(network, [t]) for t in range(len(clip.maps))])
+        count = len(clip.maps)
+        return join_maps((clip.refine(network, [t]) for t in range(count)), count)

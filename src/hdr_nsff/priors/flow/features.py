@@ -9,7 +9,7 @@ no gradient enters.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -122,11 +122,24 @@ def run_per_frame(
     The network is on `device`. It sees frames `scale` times as large, padded to a
     `multiple` of pixels.
     """
-    maps = []
     with torch.no_grad():
-        for frame in track(video, "features"):
-            maps.append(network(enlarge_and_pad(frame, scale, multiple).to(device)))
-    return torch.cat(maps)
+        frames = track(video, "features")
+        maps = (network(enlarge_and_pad(frame, scale, multiple).to(device)) for frame in frames)
+        return join_maps(maps, len(video))
+
+
+def join_maps(maps: Iterable[Tensor], count: int) -> Tensor:
+    """The maps (1, C, h, w) of `count` frames, at least one, as one (T, C, h, w). It is
+    filled as they come, since a list would hold all of them a second time.
+    """
+    frames = iter(maps)
+    first = next(frames)
+    joined = first.new_empty(count, *first.shape[1:])
+    joined[:1] = first
+    del first
+    for t, found in enumerate(frames, 1):
+        joined[t : t + 1] = found
+    return joined
 
 
 def enlarge_and_pad(frame: np.ndarray, scale: float, multiple: int) -> Tensor:
