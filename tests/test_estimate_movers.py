@@ -240,6 +240,7 @@ def test_the_tuning_reaches_tracks_and_segmentation(short: Clip) -> None:
     dense, sparse = estimate_movers(*given), estimate_movers(*given, tuning)
     assert any(mover.has_shape for mover in dense)
     assert not any(mover.has_shape for mover in sparse)
+    assert {mover.spacing for mover in dense} == {3} and {mover.spacing for mover in sparse} == {6}
     # a quarter of the tracks start
     assert sum(len(m.trust) for m in sparse) < 0.3 * sum(len(m.trust) for m in dense)
 

@@ -93,6 +93,13 @@ def test_what_touches_a_mover_whenever_it_is_seen_is_a_part_of_it() -> None:
     assert not is_part_of(seen_at(26), seen_at(35)) and not is_part_of(hand, later)
 
 
+def test_tracks_that_start_far_apart_touch_from_farther_away() -> None:
+    """Neighbors of a grid touch, however wide it is."""
+    for spacing, touch in ((3.0, False), (6.0, False), (9.0, True)):
+        hand, arm = (replace(seen_at(x), spacing=spacing) for x in (20, 31))
+        assert is_part_of(hand, arm) == touch  # their nearest tracks are 9 pixels apart
+
+
 def test_a_part_of_what_is_not_rigid_is_not_rigid(six: Scene) -> None:
     clip, flow, valid, pairs = video_of(six)
     disparity = np.stack([f.disparity.numpy() for f in six.train if f.disparity is not None])

@@ -101,6 +101,28 @@ def test_what_moves_out_of_reach_of_a_rigid_mover_is_none_of_it() -> None:
     assert nearest_mover([shapeless], 1, pixels, CAMERA).tolist() == [0] * 5
 
 
+def test_a_mover_of_sparse_tracks_reaches_farther() -> None:
+    """1.33 spacings, as 8 pixels are where tracks start 6 pixels apart."""
+    dense = replace(mover([[4.0, 2.0]], [[0, 0, 1]]), spacing=6)
+    sparse = replace(dense, spacing=18.0)
+    pixels = np.array([[11.5, 2.0], [12.5, 2.0], [27.5, 2.0], [28.5, 2.0]])
+    moving, far = np.ones((4, 30), bool), np.full((4, 30), 0.8, np.float32)
+    for one, owners, reach in ((dense, [0] + [NO_MOVER] * 3, 12), (sparse, [0] * 3 + [-1], 28)):
+        assert nearest_mover([one], 1, pixels, CAMERA).tolist() == owners
+        found, _ = fill_mover_depth([one], 1, moving, C2W, far, np.zeros_like(far))
+        assert (found[2, :reach] == 1).all() and (found[2, reach:] == far[2, reach:]).all()
+
+
+def test_movers_of_a_file_without_spacing_count_as_dense(tmp_path: Path) -> None:
+    path = tmp_path / "movers.npz"
+    write_movers(path, [replace(mover([[1, 1]], [[0, 0, 1]]), spacing=17)])
+    assert read_movers(path)[0].spacing == 17
+    with np.load(path) as arrays:
+        older = {name: arrays[name] for name in arrays.files if name != "0/spacing"}
+    np.savez(path, **older)  # type: ignore[arg-type]
+    assert read_movers(path)[0].reach_px == 8
+
+
 def test_what_moves_while_no_track_is_seen_is_a_mover_where_its_shape_is() -> None:
     seen = mover([[4.0, 2.0]], [[0, 0, 1]])
     hidden = replace(seen, pixels=np.full_like(seen.pixels, np.nan))

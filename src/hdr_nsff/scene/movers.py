@@ -24,6 +24,10 @@ from hdr_nsff.geometry import pinhole
 VERSION = 2  # of movers.npz
 NUM_NEAREST_TRACKS = 4  # tracks that a pixel's depth is interpolated from
 MAX_TRACK_DISTANCE_PX = 8.0  # pixels from the nearest track; half or twice was not measured
+# pixels between starts of tracks, from which on limits of distance grow with them: the
+# limits were chosen for up to as many
+DENSE_SPACING_PX = 6.0
+OPTIONAL_ARRAYS = ("spacing",)  # that files written before do not have
 TRACK_CONFIDENCE = 0.5  # at a track: its distance as a whole rests on priors
 NO_MOVER = -1  # owner of a pixel that moves, but with none of the movers
 MAX_DEPTH_RATIO = 2.0  # a pixel's depth changes by less than this factor
@@ -49,6 +53,17 @@ class Mover:
     flow_residual: float = 0.0
     flow_uncertainty: float = 0.0
     rigid: bool = True  # its motion explains its flow, within that uncertainty
+    spacing: float = 3.0  # pixels from the start of one track to the next
+
+    @property
+    def sparseness(self) -> float:
+        """The factor on limits of distance in pixels; 1 where tracks are dense."""
+        return max(1.0, self.spacing / DENSE_SPACING_PX)
+
+    @property
+    def reach_px(self) -> float:
+        """The distance from its nearest track up to which a pixel is on the mover."""
+        return MAX_TRACK_DISTANCE_PX * self.sparseness
 
     @property
     def has_shape(self) -> bool:
@@ -97,12 +112,13 @@ def fill_mover_depth(
     weight = same_mover / (distance + 0.5) ** 2
     found = (weight * inverse_depths[nearest]).sum(1) / weight.sum(1)
     change = np.abs(np.log(found / np.maximum(disparity[y, x], 1e-9)))
-    near = (distance[:, 0] < MAX_TRACK_DISTANCE_PX) & (change < np.log(MAX_DEPTH_RATIO))
+    reach = np.array([mover.reach_px for mover in movers])[owners[nearest[:, 0]]]
+    near = (distance[:, 0] < reach) & (change < np.log(MAX_DEPTH_RATIO))
     rigid = np.array([mover.rigid for mover in movers])[owners[nearest[:, 0]]]
     near &= rigid | ((confidence[y, x] <= TRACK_CONFIDENCE) & (not rigid_only))
     y, x = y[near], x[near]
     disparity[y, x] = found[near]
-    falloff = np.exp(-((distance[near, 0] / MAX_TRACK_DISTANCE_PX) ** 2))
+    falloff = np.exp(-((distance[near, 0] / reach[near]) ** 2))
     confidence[y, x] = np.maximum(confidence[y, x], TRACK_CONFIDENCE * falloff)
     return disparity, confidence
 
@@ -147,10 +163,10 @@ def nearest_mover(
     distance, nearest = cKDTree(np.concatenate(tracks)).query(pixels)
     owner = owners[nearest]
     for k, (mover, shape) in enumerate(zip(movers, shapes, strict=True)):
-        far = np.nonzero((owner == k) & (distance > MAX_TRACK_DISTANCE_PX))[0]
+        far = np.nonzero((owner == k) & (distance > mover.reach_px))[0]
         if mover.rigid and len(shape) and len(far):
             to_shape = cKDTree(shape).query(pixels[far])[0]
-            owner[far[to_shape > MAX_TRACK_DISTANCE_PX]] = NO_MOVER
+            owner[far[to_shape > mover.reach_px]] = NO_MOVER
     return owner
 
 
@@ -250,8 +266,10 @@ def read_movers(path: Path) -> tuple[Mover, ...]:
 
 def mover_of(data: dict[str, np.ndarray], k: int) -> Mover:
     """The mover number `k` of a file's arrays; KeyError where an array is missing."""
-    values: dict[str, Any] = {f.name: data[f"{k}/{f.name}"] for f in fields(Mover)}
-    for name in ("error", "flow_residual", "flow_uncertainty"):
+    names = [f.name for f in fields(Mover)]
+    given = [n for n in names if n not in OPTIONAL_ARRAYS or f"{k}/{n}" in data]
+    values: dict[str, Any] = {name: data[f"{k}/{name}"] for name in given}
+    for name in {"error", "flow_residual", "flow_uncertainty", "spacing"}.intersection(given):
         values[name] = float(values[name])
     values["rigid"] = bool(values["rigid"])
     return Mover(**values)

@@ -76,6 +76,7 @@ def mover_of(frames: np.ndarray, tracks: Tracks, segment: Segment) -> Mover:
         center=motion.center,
         known=motion.known,
         error=error,
+        spacing=tracks.spacing,
     )
 
 

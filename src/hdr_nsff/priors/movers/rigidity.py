@@ -87,13 +87,14 @@ def judge_rigidity(
 
 def is_part_of(mover: Mover, other: Mover, tuning: RigidityTuning = RIGIDITY_TUNING) -> bool:
     """Whether a mover touches another one nearly whenever it is seen."""
+    reach = tuning.touching_px * max(mover.sparseness, other.sparseness)
     seen = touches = 0
     for t in range(len(mover.frames)):
         own, others = tracks_in_picture(mover, t), tracks_in_picture(other, t)
         if len(own):
             seen += 1
         if len(own) and len(others):
-            touches += float(cKDTree(others).query(own)[0].min()) <= tuning.touching_px
+            touches += float(cKDTree(others).query(own)[0].min()) <= reach
     return touches > tuning.min_touching_share * seen
 
 

@@ -54,7 +54,8 @@ class RigidityTuning:
     """Flow is never taken to be surer than this, exact flow of a rendered scene
     neither."""
     touching_px: float = 6.0
-    """Distance of the nearest tracks of two movers that touch."""
+    """Distance of the nearest tracks of two movers that touch; more where tracks are
+    sparse."""
     min_touching_share: float = 0.8
     """Of the times at which a mover is seen: a part of another one touches it in more.
     A wrist touches the hand in all of them, rendered bodies that pass each other do in
