@@ -12,7 +12,7 @@ import torch
 from fakes import SPEED, DiscBeforeWall, W, camera, fake_run
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.rendering.shot_views import plan_shot
+from hdr_nsff.rendering.shot_views import SHOTS, plan_shot
 from hdr_nsff.rendering.shots import filmed_frame
 from hdr_nsff.rendering.stills import render_still
 
@@ -62,6 +62,12 @@ def test_paths_that_the_footage_cannot_show_are_refused(tmp_path: Path) -> None:
         plan_shot(run, path_file(tmp_path, 0.0, 7.5))
     with pytest.raises(InputError, match=r"leaves the clip's viewpoint.*; only turn the camera"):
         plan_shot(still, path_file(tmp_path, 0.5, 1.0))
+
+
+@pytest.mark.parametrize("name", SHOTS)
+def test_a_path_file_with_the_name_of_a_shot_is_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(InputError, match=f"replace those of `--path {name}`; rename the file"):
+        plan_shot(fake_run(tmp_path), str(tmp_path / f"{name}.json"))
 
 
 def test_held_out_frames_have_their_pictures_too(tmp_path: Path) -> None:

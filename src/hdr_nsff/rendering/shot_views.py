@@ -60,12 +60,16 @@ def plan_shot(
     if not path.endswith(".json"):
         known = "training, fixed, bullet, slowmo, all or a .json file"
         raise InputError(f"--path {shorten(path)!r}: not known; use {known}")
+    name = Path(path).stem
+    if name in SHOTS:
+        problem = f"its pictures would replace those of `--path {name}`"
+        raise InputError(f"--path {path}: {problem}; rename the file")
     views = paths.read_path(path, start.camera)
     if len(views) > MAX_VIEWS:
         limit = f"a shot has at most {MAX_VIEWS:,}; write fewer"
         raise InputError(f"{path}: {len(views):,} views; {limit}")
     check_views(run, path, views)
-    return Shot(Path(path).stem, views, fps)
+    return Shot(name, views, fps)
 
 
 def filmed_frames(run: Run) -> list[Frame]:
