@@ -127,6 +127,7 @@ BAD = {
     "positive focal": json.dumps([{**GOOD, "K": [[0, 0, 1], [0, 0, 1], [0, 0, 1]]}]),
     "time must be one finite": json.dumps([{**GOOD, "time": "soon"}]),
     "ev must be one finite": json.dumps([{**GOOD, "ev": [1, 2]}]),
+    "ev 61 must be an exposure in stops": json.dumps([{**GOOD, "ev": 61}]),
     "time must be one finite number up to 1e": json.dumps([{**GOOD, "time": 10**400}]),
     "K must be 3x3 finite numbers up to": json.dumps([{**GOOD, "K": [[1e300] * 3] * 3}]),
 }

@@ -35,6 +35,7 @@ from hdr_nsff.geometry.cameras import Camera
 REQUIRED_KEYS = {"time", "c2w"}
 KNOWN_KEYS = REQUIRED_KEYS | {"K", "ev"}
 MAX_NUMBER = 1e9  # of a path file: beyond it single precision has nothing to render
+MAX_EV = 60.0  # stops: beyond this float32 radiance is 0 or Inf
 REACH_QUANTILES = (0.1, 0.9)  # hand-chosen: single outliers among the poses do not count
 TIME_TOLERANCE = 1e-6  # of the usual gap: even times this close to the last one are it
 ROTATION_TOLERANCE = 1e-3  # per entry of R R^T: poses may be written with few digits
@@ -210,6 +211,9 @@ def parse_view(entry: Any, where: str, like: Camera) -> PathView:
     ev = None
     if entry.get("ev") is not None:
         ev = float(parse_numbers(entry["ev"], (), f"{where}: ev"))
+        if abs(ev) > MAX_EV:
+            meaning = "an exposure in stops relative to the reference, like -2 or 1.5"
+            raise InputError(f"{where}: ev {ev:g} must be {meaning}, up to {MAX_EV:g}")
     time = float(parse_numbers(entry["time"], (), f"{where}: time"))
     return PathView(replace(like, c2w=torch.from_numpy(c2w).to(like.c2w), K=K), time, ev)
 

@@ -18,6 +18,7 @@ from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say
 from hdr_nsff.footage.layouts import held_out, llff, nerfstudio
 from hdr_nsff.footage.layouts.writer import Source
+from hdr_nsff.geometry.paths import MAX_EV
 from hdr_nsff.rendering.export_gaussians import ColorTransform, export_one, export_sequence
 from hdr_nsff.rendering.export_page import BARE, PAGE, export_page
 from hdr_nsff.rendering.export_scene import CHAN, export_chan, export_usd
@@ -25,7 +26,6 @@ from hdr_nsff.rendering.usd import ENDINGS as USD_ENDINGS
 from hdr_nsff.training.run_folder import Run, read_config
 
 Layout = Literal["hdr-gopro", "nerfstudio"]
-MAX_EV = 60  # stops: beyond this float32 radiance is 0 or Inf
 # What files of these endings are
 KINDS = {PAGE: "a page", BARE: "the scene of a page", CHAN: "a camera path"}
 KINDS |= dict.fromkeys(USD_ENDINGS, "USD")

@@ -14,6 +14,7 @@ from hdr_nsff.core.hdr_video import check_encoder
 from hdr_nsff.core.io import writing_to
 from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say
+from hdr_nsff.geometry.paths import MAX_EV
 from hdr_nsff.rendering.interpolate import LayeredField
 from hdr_nsff.rendering.lens import original_lens
 from hdr_nsff.rendering.output import Output, Shot
@@ -28,7 +29,6 @@ __all__ = ["RenderConfig", "render", "render_all"]
 MAX_PIXELS = 64_000_000  # of one picture: twice those of an 8K frame
 MIN_SIDE_PX = 2  # H.264 with 4:2:0 color takes even sizes
 MAX_FPS = 1000  # no player shows more
-MAX_EV = 60  # stops: beyond this float32 radiance is 0 or Inf
 FILE = "FILE.json"
 # which paths use an option; those that are not here are used by all
 USED_BY = {

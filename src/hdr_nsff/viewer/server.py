@@ -20,13 +20,12 @@ from typing import Any, Protocol
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.geometry.paths import parse_intrinsics, parse_numbers, parse_pose
+from hdr_nsff.geometry.paths import MAX_EV, parse_intrinsics, parse_numbers, parse_pose
 from hdr_nsff.viewer.page_file import MAX_PIXELS
 
 HOST = "127.0.0.1"
 MAX_REQUEST_BYTES = 10_000
 NUM_PORTS = 2**16
-MAX_EV = 60.0  # stops: beyond this float32 radiance is 0 or Inf
 CURVES = ("camera", "agx", "neutral", "reinhard", "clip")  # that develop radiance
 VIEWS = ("radiance", "depth", "motion", "flow")
 KINDS = {"jpeg": "image/jpeg", "png8": "image/png", "png16": "image/png"}  # of files
