@@ -233,11 +233,14 @@ REFUSED = {
     "render a b": "'b': one argument too many; name it by its option (--out), leave it out, or",
     "synth cave out": "NAME cave: no such choice; choose one of interior, lamp",
     "train": "train: name a preset first, as in `hdr-nsff train splat`; the presets are splat,",
+    "train --tyro-print-completion bash": "train: name a preset first",
     "train --steps 3": "train: name a preset first",
     "train splatt a b": "no preset 'splatt' (did you mean splat?); the presets are splat, grid,",
     "train tiny --steps x": "--steps x: not a whole number; `hdr-nsff train tiny --help`",
     "train tiny --steps": "--steps: no value follows; `hdr-nsff train tiny --help` explains",
     "train splat --field.statik 3": "--field.statik: no such option (did you mean --field.static?)",
+    "render --tyro-print-completion bash": "--tyro-print-completion: no such option; `hdr-nsff r",
+    "check --tyro_write_completion bash a": "--tyro_write_completion: no such option; `hdr-nsff c",
     "doctor extra": "'extra': `doctor` takes no arguments; leave it out",
 }
 

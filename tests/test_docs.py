@@ -49,7 +49,7 @@ COMMAND = re.compile(r"hdr-nsff +([a-z][a-z-]*)([^\n#&|;)]*)")
 SETTING = re.compile(r"--set ([\w.]+)=([\w.]+)")
 # of pip, torchrun, Chromium and other programs that the documentation calls
 FOREIGN_FLAGS = {"--no-deps", "--local-dir", "--version", "--help"}
-FOREIGN_FLAGS |= {"--nproc-per-node", "--no-python", "--array", "--tyro-print-completion"}
+FOREIGN_FLAGS |= {"--nproc-per-node", "--no-python", "--array"}
 FOREIGN_FLAGS |= {"--use-angle", "--enable-unsafe-swiftshader"}
 
 by_name = pytest.mark.parametrize("page", DOCUMENTS, ids=lambda p: p.name)

@@ -248,7 +248,7 @@ def parse(name: str, config: Any, options: Sequence[str]) -> Any:
 
     InputError where it refuses them.
     """
-    from hdr_nsff.core.refusals import Command, refusals_as_sentences
+    from hdr_nsff.core.refusals import Command, refusals_as_sentences, unknown
 
     start: list[str] = []
     if isinstance(config, dict):
@@ -257,6 +257,8 @@ def parse(name: str, config: Any, options: Sequence[str]) -> Any:
     read = partial(parse_options, name, config)
     words = " ".join(["hdr-nsff", name, *start])
     command = Command(words, options, partial(read, [*start, "--help"]), partial(elsewhere, name))
+    if any(option.replace("_", "-").startswith("--tyro-") for option in options[:1]):
+        raise InputError(unknown(options, command))  # its completion takes over other commands
     with refusals_as_sentences(command):
         return read(options)
 
@@ -288,7 +290,7 @@ def check_preset(name: str, presets: dict[str, Any], options: Sequence[str]) -> 
     from hdr_nsff.core.refusals import did_you_mean
 
     first = options[0] if options else ""
-    if first in presets or first == "-h" or first.startswith(("--help", "--tyro-")):
+    if first in presets or first == "-h" or first.startswith("--help"):
         return
     listed = f"the presets are {', '.join(PRESET_HELP)}"
     if not first or first.startswith("-"):
@@ -344,8 +346,7 @@ def usage() -> str:
         "",
         *(f"  {name:<13} {verb.summary}" for name, verb in VERBS.items()),
         "",
-        "`hdr-nsff VERB --help` explains a verb. "
-        "`hdr-nsff VERB --tyro-print-completion bash` prints its shell completion.",
+        "`hdr-nsff VERB --help` explains a verb.",
     ]
     return "\n".join(lines)
 
