@@ -1,7 +1,13 @@
-"""The command line sets up the process; importing the package changes nothing."""
+"""The command line sets up the process, and importing the package changes nothing.
+Processes end with their parent.
+"""
 
+import os
+import signal
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 
 import pytest
 
@@ -63,3 +69,34 @@ def test_idle_threads_sleep_unless_the_user_sets_otherwise() -> None:
     assert output_of(wait + show) == "PASSIVE\n"
     given = "import os; os.environ['OMP_WAIT_POLICY'] = 'ACTIVE'\n"
     assert output_of(given + wait + show) == "ACTIVE\n"
+
+
+def comes_true(fact: Callable[[], bool]) -> bool:
+    """Whether something becomes true within ten seconds."""
+    for _ in range(100):
+        if fact():
+            return True
+        time.sleep(0.1)
+    return False
+
+
+def outlives_its_parent(code: str, *arguments: str) -> bool:
+    """Whether a process that watches its parent lives on where that is killed."""
+    command = [sys.executable, "-c", code, *arguments]
+    start = f"import subprocess; print(subprocess.Popen({command}).pid, flush=True); input()"
+    pipe = subprocess.PIPE
+    parent = subprocess.Popen([sys.executable, "-c", start], stdin=pipe, stdout=pipe, text=True)
+    assert parent.stdout is not None
+    child = int(parent.stdout.readline())
+    comes_true(lambda: len(os.listdir(f"/proc/{child}/task")) > 1)  # it watches
+    os.kill(parent.pid, signal.SIGKILL)
+    parent.wait()
+    if comes_true(lambda: not os.path.exists(f"/proc/{child}")):
+        return False
+    os.kill(child, signal.SIGKILL)
+    return True
+
+
+def test_a_process_does_not_outlive_its_parent() -> None:
+    watch = "from hdr_nsff.core.process import die_with_parent; die_with_parent(); "
+    assert not outlives_its_parent(f"{watch}import time; time.sleep(60)")

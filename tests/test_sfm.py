@@ -4,7 +4,6 @@ import json
 import os
 import resource
 import signal
-import subprocess
 import sys
 import time
 from dataclasses import asdict, replace
@@ -55,28 +54,6 @@ def test_a_worker_reads_no_module_from_the_current_folder(tmp_path, monkeypatch)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(sfm, "WORKER", "worker")
     sfm.run_worker(sfm.Job(str(tmp_path), [], [], 1.0, "global"))
-
-
-def test_a_worker_does_not_outlive_its_parent(tmp_path):
-    code = (
-        "import subprocess, sys, time\n"
-        "worker = 'import time; from hdr_nsff.priors.poses.sfm_child import die_with_parent; '\n"
-        "worker += 'die_with_parent(); time.sleep(60)'\n"
-        "print(subprocess.Popen([sys.executable, '-c', worker]).pid, flush=True)\n"
-        "time.sleep(60)\n"
-    )
-    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
-    assert parent.stdout is not None
-    worker = int(parent.stdout.readline())
-    time.sleep(2.0)  # until it watches
-    os.kill(parent.pid, signal.SIGKILL)
-    parent.wait()
-    for _ in range(100):
-        if not os.path.exists(f"/proc/{worker}"):
-            return
-        time.sleep(0.1)
-    os.kill(worker, signal.SIGKILL)
-    pytest.fail("the worker lives on")
 
 
 def test_processes_find_the_matches_of_one(tmp_path):

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 import pytest
 from bad_input import call, training
+from test_process import outlives_its_parent
 
 from hdr_nsff import view as module
 from hdr_nsff.core.errors import InputError
@@ -48,6 +49,10 @@ def test_training_can_be_watched(
     assert command[3:] == ["view", str(tmp_path / "run"), "--wait", "--device", "cpu"]
     assert FakeProcess.ended == 1
     assert "opens it again" in capsys.readouterr().err
+
+
+def test_the_viewer_ends_where_training_is_killed(tmp_path: Path) -> None:
+    assert not outlives_its_parent(module.VIEWER, "view", str(tmp_path), "--wait")
 
 
 def test_a_run_that_never_began_is_not_offered(

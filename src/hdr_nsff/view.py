@@ -18,6 +18,10 @@ from hdr_nsff.rendering.served_run import ServedRun, newest_checkpoint
 from hdr_nsff.viewer.server import ViewerServer
 
 WAIT_SECONDS = 0.5  # between two looks for a first checkpoint
+VIEWER = (  # the program of the viewer beside training
+    "from hdr_nsff.core.process import die_with_parent; die_with_parent(); "
+    "from hdr_nsff.cli import main; main()"
+)
 
 
 @dataclass(frozen=True)
@@ -57,13 +61,13 @@ def view(config: ViewConfig) -> None:
 
 @contextmanager
 def viewer_beside(run: Path) -> Iterator[None]:
-    """Show a run while it trains: a viewer in another process, which ends with it.
+    """Show a run while it trains: a viewer in another process, which ends with it, even
+    where that was killed.
 
     It renders on the CPU, as the GPU is at work.
     """
-    code = "from hdr_nsff.cli import main; main()"
     arguments = ["view", str(run), "--wait", "--device", "cpu"]
-    viewer = subprocess.Popen([sys.executable, "-P", "-c", code, *arguments])
+    viewer = subprocess.Popen([sys.executable, "-P", "-c", VIEWER, *arguments])
     try:
         yield
     finally:

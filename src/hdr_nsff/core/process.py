@@ -1,5 +1,5 @@
 """What this process asks of its machine: how idle threads wait, how many threads torch
-uses, and how freed memory is kept.
+uses, how freed memory is kept; and that it ends with its parent.
 
 Importing `hdr_nsff` changes none of it. The command line calls `prepare_process` before
 it imports a verb; a program that uses the package as a library may do the same.
@@ -11,6 +11,8 @@ import ctypes
 import os
 import platform
 import sys
+import threading
+import time
 from pathlib import Path
 
 # Parameters of glibc's mallopt, from malloc.h.
@@ -70,6 +72,18 @@ def limit_torch_threads(count: int) -> None:
     import torch
 
     torch.set_num_threads(count)
+
+
+def die_with_parent() -> None:
+    """End this process soon after its parent is gone (killed, too)."""
+    parent = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def usable_cores() -> int:

@@ -18,9 +18,10 @@ from typing import Any
 
 import numpy as np
 
+from hdr_nsff.core.process import die_with_parent
 from hdr_nsff.priors.poses.colmap import load_pycolmap
 from hdr_nsff.priors.poses.sfm import Job, write_matches
-from hdr_nsff.priors.poses.sfm_child import die_with_parent, send
+from hdr_nsff.priors.poses.sfm_child import send
 
 EXTRACTION_BATCH = 6  # images per call, between two steps of progress
 MATCHING_STEPS = 24  # of progress

@@ -22,7 +22,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from hdr_nsff.core.process import prepare_process, usable_cores
+from hdr_nsff.core.process import die_with_parent, prepare_process, usable_cores
 from hdr_nsff.priors.poses.colmap import load_pycolmap
 from hdr_nsff.priors.poses.colmap_matches import (
     find_matches,
@@ -33,7 +33,7 @@ from hdr_nsff.priors.poses.colmap_matches import (
     verify,
 )
 from hdr_nsff.priors.poses.sfm import LENS_FILE, Job, LensFit, SfmTuning, read_job, read_matches
-from hdr_nsff.priors.poses.sfm_child import die_with_parent, send
+from hdr_nsff.priors.poses.sfm_child import send
 from hdr_nsff.priors.poses.trimming import NUM_PINHOLE_PARAMS, trim
 
 NEVER = 1e9  # growth of a model that it does not reach
