@@ -60,9 +60,14 @@ def test_only_camera_files_are_replaced(tmp_path: Path) -> None:
     run, path = fake_run(tmp_path), tmp_path / "camera.chan"
     export_chan(run, path)
     export_chan(run, path)
-    path.write_text("my notes")
-    with pytest.raises(InputError, match="was not made by export"):
-        export_chan(run, path)
+    ours = path.read_text()
+    of_nuke = "1\t0.5\t0\t2\t0\t12.5\t0\t45\n"
+    others = ["my notes", "", of_nuke, ours.replace("\n", "0\n"), ours.partition("\n")[2]]
+    for text in others:
+        path.write_text(text)
+        with pytest.raises(InputError, match="not made by export; choose another name, or del"):
+            export_chan(run, path)
+        assert path.read_text() == text
 
 
 def test_two_tracks_of_one_camera_have_one_line_for_every_picture(tmp_path: Path) -> None:

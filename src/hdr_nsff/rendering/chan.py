@@ -8,17 +8,17 @@ camera looks along -z.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hdr_nsff.core.io import write_text
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.rendering.usd import FLIP
 
-COLUMNS = 8
+LINE = re.compile(r"(\d+)(?: -?\d+\.\d{8}){7}", re.ASCII)  # as it is written here
 
 
 def write_chan(path: Path, cameras: Sequence[Camera]) -> None:
@@ -36,10 +36,12 @@ def write_chan(path: Path, cameras: Sequence[Camera]) -> None:
 
 
 def is_chan(path: Path) -> bool:
-    """Whether a file is such a text, so that it may be replaced."""
+    """Whether a file is such a text as it is written here, so that it may be replaced:
+    cameras of other programs have other decimals, or numbers that do not start at 0.
+    """
     try:
-        rows = [line.split() for line in path.read_text(encoding="ascii").splitlines()]
-        numbers = np.array(rows, np.float64)
-    except (OSError, UnicodeError, ValueError):
+        lines = path.read_text(encoding="ascii").splitlines()
+    except (OSError, UnicodeError):
         return False
-    return numbers.ndim == 2 and numbers.shape[1] == COLUMNS
+    found = [LINE.fullmatch(line) for line in lines]
+    return bool(found) and all(m and m[1] == str(number) for number, m in enumerate(found))

@@ -129,7 +129,7 @@ def background_of(field: Splat) -> list[float]:
 def export_chan(run: Run, path: Path) -> Path:
     """Write the cameras of `render --path training`, by the numbers of its pictures."""
     if path.exists() and not is_chan(path):
-        raise InputError(f"{path}: {NOT_OURS}; choose another name")
+        raise InputError(f"{path}: {NOT_OURS}; choose another name, or delete it")
     views = plan_shot(run, "training").views
     write_chan(path, [view.camera for view in views])
     say(f"{path}: {len(views)} cameras, numbered as the pictures of the training path")
