@@ -11,13 +11,15 @@ from hdr_nsff.synth.settings import SynthConfig, parse_ev, parse_size, parse_whi
 from hdr_nsff.synth.synth import synth
 
 
-@pytest.mark.parametrize("text", ["240", "240x", "axb", "8x8", "-240x136"])
+@pytest.mark.parametrize(
+    "text", ["240", "240x", "axb", "8x8", "-240x136", "9999x9999", "9" * 5000 + "x16"]
+)
 def test_a_bad_size_is_refused_in_a_sentence(text: str) -> None:
     with pytest.raises(InputError, match="WIDTHxHEIGHT"):
         parse_size(text)
 
 
-@pytest.mark.parametrize("text", ["", "a,b", "1,,2", "nan,0", "inf"])
+@pytest.mark.parametrize("text", ["", "a,b", "1,,2", "nan,0", "inf", "61", "-40,40"])
 def test_bad_exposures_are_refused_in_a_sentence(text: str) -> None:
     with pytest.raises(InputError, match="--ev"):
         parse_ev(text)
@@ -36,6 +38,8 @@ def test_a_bad_white_balance_is_refused_in_a_sentence(text: str) -> None:
             {"frames": 3},
             {"seed": -1},
             {"spp": 0},
+            {"spp": 10**7},
+            {"truth_spp": 10**400},
             {"noise": -1.0},
             {"noise": float("nan")},
             {"response": "kodak"},

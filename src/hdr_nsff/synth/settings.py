@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -15,11 +16,14 @@ from hdr_nsff.geometry.lens import Lens
 from hdr_nsff.maths.hdr_signal import Transfer
 from hdr_nsff.radiometry.hdr_stills import HdrStill
 from hdr_nsff.radiometry.recording import Noise, response_curve
+from hdr_nsff.scene.manifest import MAX_EV
 from hdr_nsff.synth.scenes.base import Views
 from hdr_nsff.synth.scenes.geometry import intrinsics
 
 MIN_FRAMES = 12  # fewer leave no view far from the frames of its time
 MIN_SIDE = 16  # pixels of a picture
+MAX_PIXELS = 64_000_000  # of a picture, as `render` has it
+MAX_PATHS = 1_000_000  # per pixel: noise a thousandth of that of one path
 # pictures that a lens distorts are traced this much wider than the clip, and finer
 LENS_MARGIN, LENS_FINENESS = 1.25, 1.5
 MAX_SEED = 999  # seeds of pictures are made of it, see `views`
@@ -43,7 +47,7 @@ class SynthConfig:
     turn.
     """
     size: str = "240x136"
-    """Width x height in pixels."""
+    """Width x height in pixels, up to 64 megapixels."""
     frames: int = 36
     ev: str | None = None
     """Exposures that alternate, in stops and in the order they are taken, such as
@@ -133,6 +137,9 @@ def check(config: SynthConfig, min_paths: int, max_frames: int) -> None:
         raise InputError(
             f"--spp {c.spp} --truth-spp {c.truth_spp}: at least one path per pixel is needed"
         )
+    for option, paths in (("--spp", c.spp), ("--truth-spp", c.truth_spp)):
+        if paths is not None and paths > MAX_PATHS:
+            raise InputError(f"{option}: choose at most {MAX_PATHS:,} paths per pixel")
     if not 0 <= c.noise < MAX_NOISE:
         raise InputError(f"--noise {c.noise}: choose from 0 (a perfect sensor) to {MAX_NOISE:g}")
     if not (0 <= c.depth_noise < 1 and 0 <= c.depth_grain < 1):
@@ -146,14 +153,14 @@ def check(config: SynthConfig, min_paths: int, max_frames: int) -> None:
 
 def parse_size(text: str) -> tuple[int, int]:
     """(width, height) in pixels of "WxH"."""
-    width, _, height = text.lower().partition("x")
-    if width.isdecimal() and height.isdecimal():
-        size = int(width), int(height)
-        if min(size) >= MIN_SIDE:
+    found = re.fullmatch(r"(\d{1,9})x(\d{1,9})", text.lower())
+    if found:
+        size = int(found[1]), int(found[2])
+        if min(size) >= MIN_SIDE and size[0] * size[1] <= MAX_PIXELS:
             return size
     raise InputError(
         f"--size {text!r:.40}: write it as WIDTHxHEIGHT, such as 240x136, "
-        f"at least {MIN_SIDE}x{MIN_SIDE}"
+        f"at least {MIN_SIDE}x{MIN_SIDE} and at most {MAX_PIXELS / 1e6:.0f} megapixels"
     )
 
 
@@ -165,8 +172,11 @@ def parse_ev(text: str) -> list[float]:
         raise InputError(
             f"--ev {text!r:.40}: write stops with commas between them, such as -4,-2,0"
         ) from error
-    if not np.isfinite(evs).all():
-        raise InputError(f"--ev {text!r:.40}: the stops must be finite numbers")
+    if not (np.abs(evs).max() <= MAX_EV and np.ptp(evs) <= MAX_EV):
+        raise InputError(
+            f"--ev {text!r:.40}: the stops must be from {-MAX_EV:g} to {MAX_EV:g}, and no more "
+            f"than {MAX_EV:g} apart"
+        )
     return evs
 
 
