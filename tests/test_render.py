@@ -35,6 +35,7 @@ def test_settings_that_make_no_sense_are_refused_in_a_sentence(tmp_path: Path) -
         "--scale inf: must be": RenderConfig(tmp_path, scale=float("inf")),
         "--factor 0: must be": RenderConfig(tmp_path, factor=0),
         "--fps -1: must be": RenderConfig(tmp_path, fps=-1.0),
+        "--fps 1e-09: no video is that slow": RenderConfig(tmp_path, fps=1e-9),
         "--ev nan": RenderConfig(tmp_path, output=Output(ev=float("nan"))),
         "nothing left to write": RenderConfig(
             tmp_path, output=Output(exr="none", png=False, video=False)

@@ -29,6 +29,7 @@ __all__ = ["RenderConfig", "render", "render_all"]
 MAX_PIXELS = 64_000_000  # of one picture: twice those of an 8K frame
 MIN_SIDE_PX = 2  # H.264 with 4:2:0 color takes even sizes
 MAX_FPS = 1000  # no player shows more
+MIN_FPS = 0.001  # video files hold no slower one
 FILE = "FILE.json"
 # which paths use an option; those that are not here are used by all
 USED_BY = {
@@ -132,6 +133,9 @@ def check_settings(config: RenderConfig) -> None:
         check_positive("--fps", config.fps)
         if config.fps > MAX_FPS:
             limit = f"no player shows that many; use {MAX_FPS} at most"
+            raise InputError(f"--fps {config.fps:g}: {limit}")
+        if config.fps < MIN_FPS:
+            limit = f"no video is that slow; use {MIN_FPS} at least"
             raise InputError(f"--fps {config.fps:g}: {limit}")
     check_used(config)
     output = config.output
