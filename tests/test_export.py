@@ -31,6 +31,7 @@ from hdr_nsff.training.run_folder import write_config
         ({"ply": True, "ply_sequence": True}, "--ply-sequence"),
         ({"ply": True, "out": Path("a.obj")}, "ends in .ply"),
         ({"ply_sequence": True, "time": 1.0}, "every training time"),
+        ({"ply_sequence": True, "out": Path("/")}, "/: .*name one below this"),
         ({"ply": True, "truth": Path("truth")}, "use it with --layout NAME"),
         ({"ply": True, "colors": ColorTransform(ev=1.0, linear=True)}, "not developed"),
         ({"ply": True, "colors": ColorTransform(ev=float("nan"))}, "in stops"),

@@ -172,6 +172,8 @@ def check_output(config: ExportConfig) -> None:
     if config.ply_sequence and out.is_file():
         advice = "--ply-sequence writes a folder, name another one"
         raise InputError(f"{out}: is a file; {advice}")
+    if config.ply_sequence and not out.resolve().name:  # whose note would be beside it
+        raise InputError(f"{out}: --ply-sequence writes a folder of its own; name one below this")
 
 
 def check_colors(colors: ColorTransform) -> None:
