@@ -98,6 +98,7 @@ def test_two_scenes_or_methods_of_one_name(
 def test_settings_that_make_no_sense(toy_folder: Path, tmp_path: Path, capsys: Capture) -> None:
     for option, value in (
         ("--jobs", 0),
+        ("--max-size", -4),
         ("--views", -1),
         ("--steps", 0),
         ("--budget", "soon"),

@@ -17,6 +17,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import SCENE_FILE
 from hdr_nsff.core.progress import say
 from hdr_nsff.evaluation.report import check_place
+from hdr_nsff.footage.frame_choice import check_max_size
 from hdr_nsff.training.run_folder import open_folder
 
 T = TypeVar("T")
@@ -37,7 +38,8 @@ def make_plan(config: BenchConfig) -> BenchPlan:
 
 
 def check_settings(config: BenchConfig) -> None:
-    """InputError for counts and budgets that make no sense."""
+    """InputError for counts, sizes and budgets that make no sense."""
+    check_max_size(config.max_size)
     if config.jobs < 1 or config.views < 0:
         advice = "choose at least one job, and no fewer than 0 views"
         raise InputError(f"--jobs {config.jobs} --views {config.views}: {advice}")

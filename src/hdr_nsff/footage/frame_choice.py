@@ -21,12 +21,17 @@ def check_choice(
             f"frames {shorten(start)} to {shorten(last)} in steps of {shorten(stride)}: "
             "nothing to read; correct --start, --end, --stride"
         )
-    if max_size < MIN_MAX_SIZE:
-        raise InputError(f"--max-size {shorten(max_size)}: too small; use at least {MIN_MAX_SIZE}")
+    check_max_size(max_size)
     if hold_out is not None and (hold_out < 0 or hold_out == 1):
         problem = "leaves nothing to train on" if hold_out == 1 else "no number of frames"
         advice = "use 2 or more to hold out every N-th frame, 0 for none"
         raise InputError(f"--hold-out {shorten(hold_out)}: {problem}; {advice}")
+
+
+def check_max_size(max_size: int) -> None:
+    """InputError for a longest side that shrinks every clip to nothing."""
+    if max_size < MIN_MAX_SIZE:
+        raise InputError(f"--max-size {shorten(max_size)}: too small; use at least {MIN_MAX_SIZE}")
 
 
 def no_frame(clip: Path, start: int, count: int) -> str:
