@@ -109,6 +109,15 @@ def test_a_scene_folder_among_the_cameras_is_none_of_them(tmp_path):
     assert len(open_footage(tmp_path).cameras) == 2
 
 
+def test_a_scene_is_no_footage(tmp_path):
+    folder_of(tmp_path, [0.5] * 3)
+    (tmp_path / "scene.json").write_text('{"scale": 1, "center": [0, 0, 0]}')  # of a data set
+    assert open_footage(tmp_path).count == 3
+    (tmp_path / "scene.json").write_text('{"version": 2, "bracket_ev": [], "frames": []}')
+    with pytest.raises(InputError, match=r"is a prepared scene, .*hdr-nsff train splat --scene"):
+        open_footage(tmp_path)
+
+
 def test_a_folder_of_videos_is_a_rig(tmp_path):
     for name, value in (("cam10.mp4", 0.6), ("cam2.mp4", 0.3)):
         write_video(tmp_path / name, [picture(value)] * 4, fps=12)

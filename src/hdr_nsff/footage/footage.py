@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import SCENE_FILE
+from hdr_nsff.core.io import SCENE_FILE, read_json
 from hdr_nsff.core.video import is_interlaced, video_info
 from hdr_nsff.footage.frame_files import (
     FRAMES,
@@ -135,6 +135,9 @@ def open_footage(clip: Path) -> Footage:
         return open_video(clip)
     if not clip.is_dir():
         raise InputError(f"{clip}: no such file or folder; give {ACCEPTED}")
+    if is_scene(clip):
+        command = f"hdr-nsff train splat --scene {shlex.quote(str(clip))}"
+        raise InputError(f"{clip}: is a prepared scene, no footage; train it with `{command}`")
     cameras = [frame_files(clip)]
     if not cameras[0]:
         if video_files(clip):
@@ -157,6 +160,17 @@ def open_footage(clip: Path) -> Footage:
             "keep one kind in the folder"
         )
     return Footage(clip, cameras, False, len(first), FOLDER_FPS, linear.pop())
+
+
+def is_scene(folder: Path) -> bool:
+    """Whether a folder is a scene, as `prepare` writes it: data sets, too, may hold a
+    file of that name.
+    """
+    try:
+        document = read_json(folder / SCENE_FILE)
+    except (OSError, ValueError):
+        return False
+    return isinstance(document, dict) and {"frames", "bracket_ev"} <= document.keys()
 
 
 def open_video(clip: Path) -> Footage:
