@@ -105,6 +105,8 @@ def test_path_file_is_read_back(tmp_path) -> None:
     file = tmp_path / "weg übers Feld.json"
     file.write_text(json.dumps(entries))
     first, second = paths.read_path(file, camera())
+    file.write_text(json.dumps(entries), encoding="utf-8-sig")  # as Windows Notepad does
+    assert len(paths.read_path(file, camera())) == 2
     assert first.time == 0.5 and first.ev is None and torch.equal(first.camera.K, K)
     assert torch.allclose(first.camera.c2w, pose(10.0, 1.0))
     assert (

@@ -206,7 +206,7 @@ def read_json(path: Path | str) -> Any:
     if path.exists() and not path.is_file():  # a pipe would be waited for
         raise ValueError("no ordinary file")
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(path.read_text(encoding="utf-8-sig"))  # Notepad writes a mark first
     except RecursionError as error:
         raise ValueError("nested too deeply") from error
 
