@@ -35,4 +35,6 @@ def dolly(scene: Path, out: Path) -> int:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        sys.exit(__doc__)
     print(dolly(Path(sys.argv[1]), Path(sys.argv[2])), "views")

@@ -142,6 +142,8 @@ def draw(document, arrays, time, c2w, K, width, height):
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 4:
+        sys.exit(__doc__)
     document, arrays = read(sys.argv[1])
     view = document["views"][0]
     size = document["width"], document["height"]

@@ -39,4 +39,6 @@ def render_view(folder: Path, time: float, out: Path) -> np.ndarray:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 4:
+        sys.exit(__doc__)
     render_view(Path(sys.argv[1]), float(sys.argv[2]), Path(sys.argv[3]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import runpy
 import sys
 from pathlib import Path
 
@@ -32,6 +33,7 @@ import hdr_video
 import read_scene
 import render_view
 
+EXAMPLES = Path(camera_path.__file__).parent
 SIZE = (96, 64)
 
 
@@ -118,3 +120,12 @@ def test_exr_files_become_an_hdr_video(tmp_path: Path, monkeypatch: pytest.Monke
     assert np.abs(luma(frames[1]) - expected).mean() < 2
     names = {data.type.name for data in frames[0].side_data}
     assert {"CONTENT_LIGHT_LEVEL", "MASTERING_DISPLAY_METADATA"} <= names
+
+
+@pytest.mark.parametrize("script", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)
+def test_without_arguments_an_example_tells_how_it_is_called(
+    script: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", [str(script)])
+    with pytest.raises(SystemExit, match=f"python .*{script.name} "):
+        runpy.run_path(str(script), run_name="__main__")
