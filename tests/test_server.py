@@ -116,7 +116,16 @@ def test_a_frame_ends_with_its_connection(port: int, fake: Fake) -> None:
 def test_other_names_for_this_machine_are_refused(port: int) -> None:
     assert ask(port, "GET", "/scene.hdr4d", host=f"evil.example:{port}")[0] == 403
     assert ask(port, "POST", "/frame", json.dumps(REQUEST), host="evil.example")[0] == 403
-    assert ask(port, "GET", "/version", host=f"localhost:{port}")[0] == 200
+    assert ask(port, "GET", "/version", host="localhost.evil.example")[0] == 403
+
+
+@pytest.mark.parametrize("host", ["localhost:9999", "127.0.0.1:9999", "[::1]:9999", "localhost"])
+def test_a_tunnel_may_have_another_port(port: int, host: str) -> None:
+    assert ask(port, "GET", "/", host=host)[0] == 200
+    assert ask(port, "POST", "/frame", json.dumps(REQUEST), host=host)[0] == 200
+    headers = {"Host": host, "Origin": f"http://{host}"}
+    assert post(port, json.dumps(REQUEST), headers) == 200
+    assert post(port, json.dumps(REQUEST), {"Host": host, "Origin": "http://evil.example"}) == 403
 
 
 @pytest.mark.parametrize(

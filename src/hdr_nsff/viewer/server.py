@@ -26,9 +26,12 @@ from hdr_nsff.viewer.page_file import MAX_PIXELS
 HOST = "127.0.0.1"
 MAX_REQUEST_BYTES = 10_000
 NUM_PORTS = 2**16
+# as a browser names this machine; the port is another one behind a tunnel
+LOCAL = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?")
 CURVES = ("camera", "agx", "neutral", "reinhard", "clip")  # that develop radiance
 VIEWS = ("radiance", "depth", "motion", "flow")
 KINDS = {"jpeg": "image/jpeg", "png8": "image/png", "png16": "image/png"}  # of files
+NOT_LOCAL = b"not from this machine: open the page at localhost or 127.0.0.1"
 LENGTH = re.compile(r"\d{1,9}")  # of a request in bytes
 RANGE = re.compile(r"bytes=(\d{1,18})-(\d{0,18})")  # of a file, as players ask for it
 
@@ -108,7 +111,7 @@ class Handler(BaseHTTPRequestHandler):
         source = self.server.source
         match self.path.partition("?")[0]:
             case _ if not self.is_local():
-                self.answer(HTTPStatus.FORBIDDEN, "text/plain", b"not from this machine")
+                self.answer(HTTPStatus.FORBIDDEN, "text/plain", NOT_LOCAL)
             case "/":
                 self.answer(HTTPStatus.OK, "text/html; charset=utf-8", source.page().encode())
             case "/scene.hdr4d":
@@ -122,7 +125,7 @@ class Handler(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         if not (self.is_local() and self.is_own_page()) or self.path != "/frame":
-            self.answer(HTTPStatus.FORBIDDEN, "text/plain", b"not from this machine")
+            self.answer(HTTPStatus.FORBIDDEN, "text/plain", NOT_LOCAL)
             return
         try:
             request = parse_request(self.read_body())
@@ -165,12 +168,11 @@ class Handler(BaseHTTPRequestHandler):
         self.answer(HTTPStatus.PARTIAL_CONTENT, "video/mp4", data[first : last + 1], part)
 
     def is_local(self) -> bool:
-        """Whether the address was this machine's.
+        """Whether the address was this machine's, at any port.
 
-        Pages of other sites that let their name point to 127.0.0.1 have another one.
+        Pages of other sites that let their name point to 127.0.0.1 have another name.
         """
-        port = self.server.server_port
-        return self.headers.get("Host") in (f"{HOST}:{port}", f"localhost:{port}")
+        return LOCAL.fullmatch(self.headers.get("Host", "")) is not None
 
     def is_own_page(self) -> bool:
         """Whether our page asks, or no page at all; those of other sites may not."""
