@@ -195,7 +195,7 @@ def test_requests_that_make_no_sense_are_refused(change: dict, word: str) -> Non
         parse_request(json.dumps({**REQUEST, **change}).encode())
 
 
-@pytest.mark.parametrize("data", [b"", b"{", b"[]", b"\xff"])
+@pytest.mark.parametrize("data", [b"", b"{", b"[]", b"\xff", 9000 * b"["])
 def test_requests_that_are_no_objects_are_refused(data: bytes) -> None:
     with pytest.raises(InputError, match="not"):
         parse_request(data)

@@ -216,7 +216,7 @@ def parse_request(data: bytes) -> FrameRequest:
     """The request in a JSON text. InputError for anything else."""
     try:
         entries = json.loads(data)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError("frame: not JSON") from error
     if not isinstance(entries, dict):
         raise InputError("frame: not a JSON object")
