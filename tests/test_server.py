@@ -9,10 +9,13 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.viewer.server import FrameRequest, ViewerServer, parse_request
+from hdr_nsff.viewer.display import png
+from hdr_nsff.viewer.field_scene import jpeg
+from hdr_nsff.viewer.server import MAX_SIDE, FrameRequest, ViewerServer, parse_request
 
 REQUEST = {
     "time": 1.5,
@@ -180,6 +183,8 @@ def test_videos_are_served_whole_or_in_part(
         ({"time": "now"}, "time must be one finite number"),
         ({"width": 100_000, "height": 100_000}, "at most 4,000,000"),
         ({"height": 0}, "48 x 0 pixels"),
+        ({"width": 4_000_000, "height": 1}, "at most 65,500 a side"),
+        ({"width": 1, "height": 65_501}, "at most 65,500 a side"),
         ({"ev": 1000}, "beyond 60 stops"),
         ({"curve": "round"}, "curve must be one of"),
         ({"show": None}, "show must be one of"),
@@ -193,6 +198,11 @@ def test_videos_are_served_whole_or_in_part(
 def test_requests_that_make_no_sense_are_refused(change: dict, word: str) -> None:
     with pytest.raises(InputError, match=word):
         parse_request(json.dumps({**REQUEST, **change}).encode())
+
+
+def test_the_largest_sides_fit_into_every_kind_of_file() -> None:
+    for rgb in (np.zeros((1, MAX_SIDE, 3)), np.zeros((MAX_SIDE, 1, 3))):
+        assert jpeg(rgb) and png(rgb, 8) and png(rgb, 16)
 
 
 @pytest.mark.parametrize("data", [b"", b"{", b"[]", b"\xff", 9000 * b"["])

@@ -28,6 +28,7 @@ MAX_REQUEST_BYTES = 10_000
 NUM_PORTS = 2**16
 # as a browser names this machine; the port is another one behind a tunnel
 LOCAL = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?")
+MAX_SIDE = 65_500  # pixels: longer ones fit into no JPEG file of libjpeg
 CURVES = ("camera", "agx", "neutral", "reinhard", "clip")  # that develop radiance
 VIEWS = ("radiance", "depth", "motion", "flow")
 KINDS = {"jpeg": "image/jpeg", "png8": "image/png", "png16": "image/png"}  # of files
@@ -223,6 +224,8 @@ def parse_request(data: bytes) -> FrameRequest:
     width, height = (round(number(entries, name)) for name in ("width", "height"))
     if not (width > 0 and height > 0 and width * height <= MAX_PIXELS):
         raise InputError(f"frame: {width} x {height} pixels; at most {MAX_PIXELS:,} are rendered")
+    if max(width, height) > MAX_SIDE:
+        raise InputError(f"frame: {width} x {height} pixels; at most {MAX_SIDE:,} a side")
     ev = number(entries, "ev")
     if abs(ev) > MAX_EV:
         raise InputError(f"frame: ev {ev:g} is beyond {MAX_EV:g} stops")
