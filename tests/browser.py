@@ -116,6 +116,14 @@ class Page:
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": mobile}
         self.call("Emulation.setDeviceMetricsOverride", **size)
 
+    def move_to_screen(self, width: int, height: int, density: int) -> None:
+        """Move the window to a screen of `density` pixels per CSS pixel."""
+        size = {"width": width, "height": height, "deviceScaleFactor": density, "mobile": False}
+        self.call("Emulation.setDeviceMetricsOverride", **size)
+        # a density alone is noticed only when another emulated medium is looked at
+        for features in ([{"name": "prefers-color-scheme", "value": "dark"}], []):
+            self.call("Emulation.setEmulatedMedia", features=features)
+
     def run(self, expression: str) -> Any:
         """The value of a JavaScript expression, awaited."""
         answer = self.call(

@@ -184,6 +184,14 @@ def test_the_picture_and_the_controls_fit_the_window(
         assert right - left > 20 and bottom - top > 20
 
 
+def test_a_screen_of_another_density_gets_its_own_pixels(viewer: Page) -> None:
+    viewer.run("viewer.easeOff = () => false")  # however slowly this machine draws
+    width = viewer.run("viewer.canvas.width")
+    for density in (2, 1, 2):
+        viewer.move_to_screen(500, 300, density)
+        viewer.wait(f"Math.abs(viewer.canvas.width - {density * width}) <= 1")
+
+
 # Over time
 
 

@@ -41,6 +41,7 @@ export function connectControls(player) {
   player.changed = refresh;
   const resize = () => layout(player);
   new ResizeObserver(resize).observe(find("stage"));
+  watchDensity(resize);
   resize();
   refresh();
 }
@@ -375,6 +376,16 @@ function showSplit(player, scene, state) {
   find("divider").ariaValueNow = String(Math.round(percent));
   const ev = Math.round(10 * nearest.ev) / 10;
   find("recorded-label").textContent = `Recorded, ${stops(ev)} EV`;
+}
+
+/** Call `changed` whenever the window has come to a screen of another pixel density. */
+function watchDensity(changed) {
+  const here = matchMedia(`(resolution: ${devicePixelRatio}dppx)`);
+  const renewed = () => {
+    changed();
+    watchDensity(changed);
+  };
+  here.addEventListener("change", renewed, { once: true });
 }
 
 function layout(player) {
