@@ -192,11 +192,22 @@ def test_every_cut_covers_the_clip_and_ends_in_training_frames(config, seconds, 
         ({"segment": -1.0}, "give the seconds of a segment"),
         ({"segment": 1e308}, "give the seconds of a segment"),
         ({"mask_points": Path("points.json")}, "--mask-points"),
+        ({"rig": 2}, "2 cameras take the frames in turn"),
     ],
 )
 def test_segments_that_cannot_be_are_refused_in_a_sentence(config, changes, sentence, tmp_path):
     with pytest.raises(InputError, match=sentence):
         prepare(replace(config, out=tmp_path / "out", **changes))
+
+
+def test_a_clip_that_cannot_be_cut_is_refused_before_flow(config, tmp_path):
+    short = replace(config, out=tmp_path / "out", segment=0.1)
+    with pytest.raises(InputError, match=r"--segment 0\.1: 2 frames"):
+        prepare(short)
+    assert list(Manifest.load(short.out / "clip").steps) == ["frames", "exposure"]
+    with pytest.raises(InputError, match="in turn"):
+        prepare(replace(config, out=tmp_path / "rig", rig=2))
+    assert not (tmp_path / "rig").exists()
 
 
 def test_segments_do_not_go_into_a_folder_with_something_else(config, tmp_path):

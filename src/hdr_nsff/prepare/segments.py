@@ -58,7 +58,17 @@ def check_segments(config: PrepareConfig) -> None:
         raise InputError(
             "--segment and --mask-points both given: points name frames of one scene; leave one out"
         )
+    check_rig(seconds, config.rig or 1)
     check_place(config.out)
+
+
+def check_rig(seconds: float, rig: int) -> None:
+    """InputError for several cameras that take the frames in turn."""
+    if rig > 1:
+        raise InputError(
+            f"--segment {seconds:g}: {rig} cameras take the frames in turn, and each is needed "
+            "from its first visit to its last; leave the option out"
+        )
 
 
 def check_place(out: Path) -> None:
@@ -81,7 +91,8 @@ def prepare_segments(clip: Work) -> list[Path]:
     """Run every step that is not done, of the whole clip and of its segments; the scene
     folders. InputError where the clip cannot be cut.
     """
-    run_steps(clip, {name: STEPS[name] for name in OF_CLIP})
+    steps = {name: STEPS[name] for name in OF_CLIP}
+    run_steps(clip, steps | {"flow": replace(STEPS["flow"], check=check_flow_and_cut)})
     clip.forget(("equalized", "raw_flows", "visits"))
     segments = cut_clip(clip)
     for segment in segments:
@@ -114,6 +125,14 @@ def report(clip: Work, folders: list[Path]) -> None:
 # Where the clip is cut
 
 
+def check_flow_and_cut(clip: Work) -> None:
+    """InputError for bad input of flow or later steps, and where frames and exposures
+    tell that the clip cannot be cut.
+    """
+    STEPS["flow"].check(clip)
+    cut_clip(clip)
+
+
 def cut_clip(clip: Work) -> list[Segment]:
     """The segments of a clip: of equal length, at most `--segment`, overlapping by an
     exposure cycle. Their first and last frames are training frames, so that they know
@@ -121,11 +140,7 @@ def cut_clip(clip: Work) -> list[Segment]:
     """
     m, seconds = clip.manifest, clip.config.segment
     assert seconds is not None
-    if m.rig > 1:
-        raise InputError(
-            f"--segment {seconds:g}: {m.rig} cameras take the frames in turn, and each is needed "
-            "from its first visit to its last; leave the option out"
-        )
+    check_rig(seconds, m.rig)
     overlap = max(m.cycle, MIN_OVERLAP)
     longest = round(seconds * m.fps)
     least = max(MIN_FRAMES, 2 * overlap)
