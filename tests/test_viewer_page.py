@@ -171,7 +171,9 @@ def test_without_parallax_the_camera_stays_where_it_filmed(
     assert "only turned" in tab.run("document.getElementById('camera-note').textContent")
 
 
-@pytest.mark.parametrize(("width", "height"), [(1280, 800), (390, 844), (844, 390)])
+@pytest.mark.parametrize(
+    ("width", "height"), [(1280, 800), (390, 844), (844, 390), (640, 360), (568, 320)]
+)
 def test_the_picture_and_the_controls_fit_the_window(
     tab: Page, toy: Scene, tmp_path: Path, width: int, height: int
 ) -> None:
@@ -190,6 +192,40 @@ def test_a_screen_of_another_density_gets_its_own_pixels(viewer: Page) -> None:
     for density in (2, 1, 2):
         viewer.move_to_screen(500, 300, density)
         viewer.wait(f"Math.abs(viewer.canvas.width - {density * width}) <= 1")
+
+
+def wait_until_filled(viewer: Page, room: str) -> None:
+    """Wait until the picture is as large as the stage's width and a height allow."""
+    viewer.wait(
+        "(() => { const {scene} = viewer, stage = document.getElementById('stage');"
+        "const {width, height} = document.getElementById('picture').getBoundingClientRect();"
+        f"const scale = Math.min(stage.clientWidth / scene.width, {room} / scene.height);"
+        "const off = [width - scale * scene.width, height - scale * scene.height];"
+        "return off.every(pixels => Math.abs(pixels) < 1); })()"
+    )
+
+
+TIMELINE = "document.getElementById('timeline').getBoundingClientRect().top"
+
+
+@pytest.mark.parametrize(
+    ("sizes", "room"),
+    [
+        ([(1280, 800), (844, 390), (640, 360), (568, 320)], TIMELINE),
+        ([(700, 500), (700, 800), (390, 844)], "0.55 * innerHeight"),
+    ],
+    ids=["beside the controls", "above the controls"],
+)
+def test_the_picture_takes_the_room_that_there_is(
+    viewer: Page, sizes: list[tuple[int, int]], room: str
+) -> None:
+    for width, height in sizes:
+        viewer.resize(width, height)
+        wait_until_filled(viewer, room)
+        viewer.press("h")
+        wait_until_filled(viewer, "innerHeight")
+        viewer.press("h")
+    wait_until_filled(viewer, room)
 
 
 # Over time

@@ -40,7 +40,8 @@ export function connectControls(player) {
   const refresh = () => show(player);
   player.changed = refresh;
   const resize = () => layout(player);
-  new ResizeObserver(resize).observe(find("stage"));
+  const sizes = new ResizeObserver(resize);
+  for (const element of [find("stage"), document.body]) sizes.observe(element);
   watchDensity(resize);
   resize();
   refresh();
@@ -390,9 +391,8 @@ function watchDensity(changed) {
 
 function layout(player) {
   const stage = find("stage");
-  const narrow = matchMedia("(max-width: 700px)").matches;
-  // above the controls on a phone, the picture takes the height that it needs
-  const height = narrow ? 0.55 * innerHeight : stage.clientHeight;
+  // above the controls of a narrow window, the stage is as high as its picture, up to a limit
+  const height = parseFloat(getComputedStyle(stage).maxHeight) || stage.clientHeight;
   const [width, shownHeight] = player.fit(stage.clientWidth, height);
   find("picture").style.width = `${width}px`;
   find("picture").style.height = `${shownHeight}px`;
