@@ -17,6 +17,9 @@ import pytest
 
 from hdr_nsff import cli
 from hdr_nsff.core.settings import to_plain
+from hdr_nsff.scene.manifest import FrameEntry, LensEntry, Manifest, StepRecord
+from hdr_nsff.scene.movers import Mover
+from hdr_nsff.scene.response import ResponseFile
 from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.weighted_terms import merge_weights
 
@@ -136,6 +139,21 @@ def test_the_table_of_the_method_has_the_weights_of_a_preset(preset: str, column
         number = re.match(r"\**([\d.]+)(?: / (\d))?", cells[column])
         weight = float(number[1]) / float(number[2] or 1) if number else None
         assert weight == weights.get(name), row
+
+
+@pytest.mark.parametrize(
+    ("file", "models"),
+    [
+        ("scene.json", (Manifest, LensEntry, FrameEntry, StepRecord)),
+        ("response.json", (ResponseFile,)),
+        ("movers.npz", (Mover,)),
+    ],
+)
+def test_the_formats_have_a_row_for_every_key_of_a_scene(file: str, models: tuple) -> None:
+    section = text_of(ROOT / "docs" / "formats.md").partition(f"### `{file}`\n")[2]
+    rows = re.findall(r"^\|([^|]*)\|", section.partition("\n###")[0], re.MULTILINE)
+    named = {name for row in rows for name in INLINE.findall(row)}
+    assert {key for model in models for key in model.__annotations__} - named <= {"model_config"}
 
 
 # Files and functions
