@@ -116,13 +116,18 @@ def test_restless_masks_alone_do_not(rounds, share):
 
 @pytest.mark.parametrize("fails", [2, 3])
 def test_a_later_round_that_fails_leaves_the_poses_of_the_one_before(rounds, capsys, fails):
-    poses, estimates = rounds(0.7, *RESTLESS, fails=fails)
+    poses, estimates = rounds(0.3, *RESTLESS, fails=fails)
     assert poses.parallax == "full" and poses.registered.all() and estimates == fails
     (note,) = poses.notes
     assert note.startswith("in doubt: the next round failed with masks from these: poses failed")
     assert "7 of 8 frames; give --tripod" in note and note in " ".join(
         capsys.readouterr().err.split()
     )
+
+
+def test_a_later_round_that_fails_where_rotations_explain_the_footage_means_a_turn(rounds):
+    poses, estimates = rounds(0.7, *RESTLESS, fails=2)
+    assert poses.parallax == "rotation" and estimates == 2
 
 
 def test_a_first_round_that_fails_is_an_error(rounds):

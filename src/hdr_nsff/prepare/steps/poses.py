@@ -184,6 +184,7 @@ def poses_and_masks(work: Work) -> Poses:
         write_round(cache, poses, before, earlier.model)
     if poses.parallax != "full":
         return poses
+    failure = ""
     for rounds_left in reversed(range(MAX_ROUNDS + 1)):
         found = geometric_mask(*work.raw_flows, work.equalized[0], poses.K, poses.c2w)
         moving = share_masks(work, found)
@@ -198,11 +199,13 @@ def poses_and_masks(work: Work) -> Poses:
             try:
                 poses, before = estimate(work, moving, earlier), moving
             except InputError as error:
-                reason, *_ = str(error).split(";")
-                return in_doubt(poses, f"the next round failed with masks from these: {reason}")
+                failure, *_ = str(error).split(";")
+                break
     without_parallax = poses_without_parallax(work, before, moving)
     if without_parallax is not None:
         return without_parallax
+    if failure:
+        return in_doubt(poses, f"the next round failed with masks from these: {failure}")
     if agreement < MIN_TRUSTED_IOU and is_restless(before, moving):
         rounds = MAX_ROUNDS + 1
         return in_doubt(poses, f"after {rounds} rounds masks still agree to {agreement:.0%} only")
