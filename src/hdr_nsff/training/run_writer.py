@@ -117,7 +117,9 @@ class RunWriter:
         self.spoken = True
         if self.progress.live.is_started:
             return
-        line = f"train: {clock.progress:.0%}, step {clock.step}, {self.psnr}"
+        line = f"train: {clock.progress:.0%}, step {clock.step}"
+        if self.psnr:
+            line += f", {self.psnr}"
         if clock.seconds_left is not None:
             line += f", {time_left(clock.seconds_left)}"
         self.say(line)
