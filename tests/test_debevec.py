@@ -46,6 +46,22 @@ def test_two_exposures_suffice():
     assert rmse(fit.x, fit.y, S_CURVE) < 0.02
 
 
+def test_a_lamp_that_clips_below_white_is_no_shoulder():
+    """A yellow lamp: red clips in both exposures, which the video records as 0.8 and
+    0.93. Nothing else is as bright.
+    """
+    dim = points(GAMMA22, [-3.0, 0.0], num=1500)
+    shown = dim.valid & (dim.rgb < 0.7)
+    rng = np.random.default_rng(1)
+    lamp = np.array([[0.8, 0.78, 0.1], [0.93, 0.96, 0.25]]) + rng.normal(0, 0.01, (100, 2, 3))
+    rgb = np.concatenate([dim.rgb, lamp])
+    valid = np.concatenate([shown, np.ones((100, 2, 3), bool)])
+    fit = debevec(Samples(rgb, valid, np.zeros(valid.shape, bool)), [-3.0, 0.0], reference=1)
+    for channel in fit.y:
+        middle, bright = np.interp([0.5, 0.9], channel, fit.x)
+        assert np.log2(bright / middle) == pytest.approx(2.2 * np.log2(0.9 / 0.5), abs=0.4)
+
+
 def test_unknown_exposures_of_a_typical_camera_are_recovered():
     fit = debevec(points(SRGB, EV, outliers=0.05), [None, None, None], reference=2)
     assert fit.guessed

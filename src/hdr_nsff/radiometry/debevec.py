@@ -36,6 +36,7 @@ NODES = 40  # of H
 UNKNOWNS = NODES + 2  # of a channel: the nodes of H, then a and b
 TYPICAL = (1.1, 0.5)  # a and b half way between gamma 2.2 and sRGB
 GAMMA = 2.2  # of the response assumed by estimates from brightness alone
+LEFT_OUT = 1e-6  # robust weight of a point that is far off: it may come back
 MIN_VALUE = 1e-4  # recorded values are raised to this before their logarithm
 LN2 = float(np.log(2))
 MAD_TO_SIGMA = 1.48  # standard deviation of a normal distribution per median |deviation|
@@ -61,6 +62,10 @@ class DebevecTuning:
     smoothness: float = 300.0
     prior_weight: float = 30.0  # that pulls a and b to `TYPICAL`, times the same variance
     outlier_scale: float = 2.4  # standard deviations: of the Cauchy weights (Holland 1977)
+    # a point whose misfit exceeds both is left out: video does not record light of a
+    # strong color that clips as 1, and it would pass for a shoulder of several stops
+    max_misfit: float = 0.5  # stops
+    max_scales: float = 3.0  # of `outlier_scale`
     # points that two brackets must share to be linked
     min_shared_points: int = 60
     # recorded values over which the mean curve gets the steepness of sRGB (chosen on
@@ -112,7 +117,7 @@ class Equations:
     target: np.ndarray  # (P, B)
     # (P, B) inverse variance of an observation up to a factor, 0 where it is not valid
     weight: np.ndarray
-    robust: np.ndarray  # (P, B) in (0, 1]: 1 / (1 + (residual / scale)^2)
+    robust: np.ndarray  # (P, B) in (0, 1]: 1 / (1 + (residual / scale)^2), or `LEFT_OUT`
 
     def centered(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Weights (P, B), and design and target minus their weighted mean over every
@@ -306,8 +311,8 @@ def reweight(
     log_exposure: np.ndarray,
     tuning: DebevecTuning = DebevecTuning(),
 ) -> tuple[list[Equations], float]:
-    """The equations with Cauchy weights from their misfits, and the robust standard
-    deviation of a misfit of weight 1.
+    """The equations with Cauchy weights from their misfits, without points that are far
+    off, and the robust standard deviation of a misfit of weight 1.
     """
     residuals = all_residuals(equations, curves, log_exposure)
     scaled = [r * np.sqrt(e.weight) for e, r in zip(equations, residuals, strict=True)]
@@ -316,10 +321,11 @@ def reweight(
     if observed.size:
         noise = MAD_TO_SIGMA * float(np.median(np.abs(observed))) + 1e-6
     scale = tuning.outlier_scale * noise
-    reweighted = [
-        replace(e, robust=1 / (1 + (s / scale) ** 2))
-        for e, s in zip(equations, scaled, strict=True)
-    ]
+    reweighted = []
+    for e, r, s in zip(equations, residuals, scaled, strict=True):
+        far = (np.abs(r) > tuning.max_misfit * LN2) & (np.abs(s) > tuning.max_scales * scale)
+        robust = np.where(far.any(1, keepdims=True), LEFT_OUT, 1 / (1 + (s / scale) ** 2))
+        reweighted.append(replace(e, robust=robust))
     return reweighted, noise
 
 

@@ -1,8 +1,8 @@
 """Static points with what every exposure recorded of them, found through disparity and
 poses: the input of `debevec.py`.
 
-Points lie where nothing moves and the surface is patch_statistics, so that a pixel of
-misplacement costs little. They are spread over the recorded levels. A value is the mean
+Points lie where nothing moves and the surface is flat, so that a pixel of misplacement
+costs little. They are spread over the recorded levels. A value is the mean
 of 3x3 pixels, and it counts only where all nine are away from black and saturation: a
 mean over clipped pixels is no recording.
 """
@@ -65,7 +65,7 @@ class PatchStatistics:
     mean: np.ndarray  # (H, W, 3) recorded
     unclipped: np.ndarray  # (H, W, 3) bool: all nine away from black and saturation
     saturated: np.ndarray  # (H, W, 3) bool: all nine saturated
-    good: np.ndarray  # (H, W) bool: patch_statistics, and known to be found again
+    good: np.ndarray  # (H, W) bool: flat, and known to be found again
 
 
 def static_samples(
