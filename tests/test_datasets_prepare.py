@@ -112,6 +112,16 @@ def test_disparity_up_to_scale_and_shift_is_fitted_to_the_points() -> None:
     assert "1 of 1 maps by static points" in note
 
 
+def test_flow_that_is_not_valid_does_not_mix_into_resampled_flow(tmp_path: Path) -> None:
+    valid = np.zeros((9, 12), bool)
+    valid[:, :7] = True  # not a multiple of the two pixels that become one
+    flow = np.where(valid[..., None], np.float32([6, 3]), np.float32(0))
+    np.savez(tmp_path / "flow.npz", flow=flow, mask=valid)
+    resampled, known = maps.flow_map(tmp_path / "flow.npz", (6, 8))
+    assert known[:, :4].all() and not known[:, 5:].any()
+    assert np.allclose(resampled[known], [4, 2])
+
+
 def test_maps_of_another_size_are_resampled_and_flow_is_scaled(tmp_path: Path) -> None:
     root = mini.gopro(tmp_path / "set", scale=2)  # pictures twice as large as the maps
     m = Manifest.load(prepare(PrepareConfig(root, tmp_path / "scene")))

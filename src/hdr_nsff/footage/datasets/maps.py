@@ -2,9 +2,10 @@
 depth in units of the poses.
 
 A map of the same size passes untouched; another one of the same shape is resampled:
-masks and depth by the nearest pixel, flow by area with its vectors scaled. Depth of a
-network's own units is brought to those of the poses by static points: metric depth by
-one scale for all pictures, disparity by a scale and a shift per picture.
+masks and depth by the nearest pixel, flow by the area of its valid pixels, with its
+vectors scaled. Depth of a network's own units is brought to those of the poses by
+static points: metric depth by one scale for all pictures, disparity by a scale and a
+shift per picture.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ MAX_ASPECT_ERROR = 0.02  # by which the shape of a map may differ from the frame
 MIN_POINTS = 20  # from which a scale and shift are fitted (hand-chosen)
 MAX_FAR = 3.0  # times the far bound: fitted disparity is clamped there (hand-chosen)
 FIT_ROUNDS = 5  # fits of a line, each without the worst of the last
+MIN_SHARE = 1e-6  # of valid pixels in a resampled one, that is divided by
 FIT_SHARE = 0.75  # of the points, that the next round keeps (hand-chosen)
 
 
@@ -78,8 +80,12 @@ def flow_map(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]
     check_flow(path, flow)
     height, width = size
     scale = np.array([width / flow.shape[1], height / flow.shape[0]], np.float32)
-    valid = fit_mask(path, valid, size)
-    return fit_size(path, flow, size, cv2.INTER_AREA) * scale, valid
+    resized = fit_size(path, flow, size, cv2.INTER_AREA)
+    # sets hold 0 where flow is not valid: only valid pixels count where there are some
+    share = fit_size(path, valid.astype(np.float32), size, cv2.INTER_AREA)[..., None]
+    total = fit_size(path, flow * valid[..., None], size, cv2.INTER_AREA)
+    resized = np.where(share > 0, total / np.maximum(share, MIN_SHARE), resized)
+    return resized * scale, fit_mask(path, valid, size)
 
 
 def depth_map(path: Path, size: tuple[int, int], is_metric: bool) -> np.ndarray:
