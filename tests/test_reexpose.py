@@ -115,6 +115,14 @@ def test_the_cycle_runs_unbroken_over_the_recorded_frames():
     assert [work.bracket[k] for k in work.kept] == [n % 3 for n in range(18)]
 
 
+@pytest.mark.parametrize("cycle", [2, 3, 4, 7])
+@pytest.mark.parametrize("remove", [False, True])
+def test_all_exposures_are_held_out_in_turn(cycle, remove):
+    plan = plan_frames(120, cycle, 8, remove)
+    first = [plan.bracket[k] for k in plan.test[:cycle]]
+    assert sorted(first) == list(range(cycle))
+
+
 def test_noise_repeats_with_its_seed(tmp_path):
     clip = ordinary_clip(tmp_path / "in", 4)
     images = []

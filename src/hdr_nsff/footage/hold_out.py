@@ -8,15 +8,17 @@ from collections.abc import Sequence
 HOLD_OUT = 8  # every this many frames are held out where nothing else is asked for
 
 
-def hold_out_every(count: int, every: int, cycle: int) -> list[int]:
+def hold_out_every(count: int, every: int, cycle: int, removed: bool = False) -> list[int]:
     """Which of `count` frames are held out of training: every `every`-th.
 
-    Never the first or the last; none for 0. `every` grows until it has no common factor
-    with the exposure cycle, so that all exposures are held out in turn.
+    Never the first or the last; none for 0. `every` grows until all exposures of the
+    cycle are held out in turn: until it has no common factor with the length of the
+    cycle. Where these frames are `removed` and the cycle runs over the others, until
+    the number of frames between two of them has none.
     """
     if every <= 0:
         return []
-    while math.gcd(every, cycle) > 1:
+    while math.gcd(every - removed, cycle) > 1:
         every += 1
     return list(range(every // 2, count - 1, every))
 

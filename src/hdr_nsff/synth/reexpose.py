@@ -284,7 +284,7 @@ def plan_frames(count: int, cycle: int, hold_out: int, remove: bool) -> FramePla
 
     The cycle runs over the recorded frames without a break.
     """
-    test = hold_out_every(count, hold_out, cycle)
+    test = hold_out_every(count, hold_out, cycle, removed=remove)
     missing = set(test) if remove else set()
     kept = [k for k in range(count) if k not in missing]
     if len(kept) < MIN_FRAMES:
