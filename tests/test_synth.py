@@ -22,6 +22,7 @@ from hdr_nsff.geometry import pinhole
 from hdr_nsff.geometry.lens import Lens
 from hdr_nsff.geometry.pinhole import pixel_centers, project
 from hdr_nsff.maths.hdr_signal import display_light, encode, ycbcr_planes
+from hdr_nsff.radiometry.recording import response_curve
 from hdr_nsff.scene.manifest import Manifest
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.scene.truth import Truth, true_pictures
@@ -31,7 +32,7 @@ from hdr_nsff.synth.scenes.base import Views
 from hdr_nsff.synth.scenes.geometry import intrinsics
 from hdr_nsff.synth.scenes.interior import INTERIOR
 from hdr_nsff.synth.settings import SynthConfig
-from hdr_nsff.synth.synth import lens_canvas, lens_radiance, synth
+from hdr_nsff.synth.synth import lens_canvas, lens_radiance, record_clip, synth
 from hdr_nsff.synth.views import TracedView, clip_views, held_out_views
 
 
@@ -116,6 +117,19 @@ def test_a_lens_is_in_the_recording_and_not_in_the_held_out_views(flat: SynthCon
     synth(replace(flat, oracle=False, lens="-0.1"))
     assert Flat.rendered == 12 + 16 + 12  # wider pictures of the clip alone
     assert Truth.open(flat.out / "truth").lens == [-0.1, 0]
+
+
+def test_corners_are_as_dark_as_the_rays_that_a_lens_brings_there(
+    flat: SynthConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(verb, "lens_radiance", lambda *_: np.full((16, 16, 3), 0.9))
+    config = replace(flat, ev="0", white_balance="1,1,1", vignetting=1.0, lens="-0.2", noise=0.0)
+    K = intrinsics(16, 16)
+    lens = Lens(K, (-0.2, 0, 0, 0), 16, 16)
+    clip = clip_views(INTERIOR, 12, 1, 0)
+    exposed = response_curve(config.response).invert(record_clip(clip, [0.0], K, config)[0])
+    rays = pinhole.camera_rays(lens.undistort(pixel_centers(16, 16), K), K)
+    np.testing.assert_allclose(exposed[..., 1], 0.9 / (rays**2).sum(-1) ** 2, atol=0.01)
 
 
 def test_a_pixel_through_a_lens_has_the_radiance_of_its_bent_ray(monkeypatch) -> None:

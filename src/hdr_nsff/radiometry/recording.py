@@ -93,7 +93,12 @@ def vignette(height: int, width: int, K: np.ndarray, strength: float) -> np.ndar
 
     The cos^4 law of the angle to the axis at `strength` 1, no falloff at 0.
     """
-    rays = pinhole.camera_rays(pinhole.pixel_centers(height, width), K)
+    return light_share(pinhole.pixel_centers(height, width), K, strength)
+
+
+def light_share(pixels: np.ndarray, K: np.ndarray, strength: float) -> np.ndarray:
+    """The same (..., 1) along the rays through `pixels` (..., 2)."""
+    rays = pinhole.camera_rays(pixels, K)
     squared_length = (rays**2).sum(-1, keepdims=True)  # 1 / cos^2
     return 1 - strength * (1 - squared_length**-2.0)
 

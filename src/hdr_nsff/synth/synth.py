@@ -48,7 +48,7 @@ from hdr_nsff.radiometry.hdr_references import (
     check_references,
     write_references,
 )
-from hdr_nsff.radiometry.recording import record, response_curve, vignette
+from hdr_nsff.radiometry.recording import light_share, record, response_curve
 from hdr_nsff.scene.truth import Truth, TruthView
 from hdr_nsff.synth.motion import UV, exact_flow, view_geometry
 from hdr_nsff.synth.oracle import OracleNoise, remove_stale, write_oracle
@@ -250,13 +250,16 @@ def record_clip(
     curve = response_curve(config.response)
     gains = parse_white_balance(config.white_balance)
     noise = sensor_noise(config.noise)
-    lens = parse_lens(config.lens, K, parse_size(config.size))
+    width, height = parse_size(config.size)
+    lens = parse_lens(config.lens, K, (width, height))
+    seen = pinhole.pixel_centers(height, width)  # by a pinhole camera in place of the lens
+    if lens is not None:
+        seen = lens.undistort(seen, K)
+    transmission = light_share(seen, K, config.vignetting)
     video = []
     for t, view in enumerate(clip):
         rng = np.random.default_rng([config.seed, t])
         radiance = lens_radiance(view, lens, config.out)
-        height, width = radiance.shape[:2]
-        transmission = vignette(height, width, K, config.vignetting)
         ev = relative[t % len(relative)]
         frame = record(radiance, ev, gains, curve, noise, rng, transmission)
         write_png(config.out / "clip" / f"{t:05d}.png", frame)
