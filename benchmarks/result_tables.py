@@ -124,21 +124,36 @@ def bench_lenses(document: Document) -> Lines:
     """One line per effect of a lens or shutter: PSNR without its model and with it, on
     clips with the effect and without, and the ratio of training times on the latter.
     """
-    found = {(run["scene"], run["method"]): run["values"] for run in document["results"]}
-    scenes = [scene.removesuffix("-plain") for scene, _ in found if scene.endswith("-plain")]
-    scenes = list(dict.fromkeys(scenes))
+    runs = document["results"]
+    names = [run["scene"] for run in runs if run["scene"].endswith("-plain")]
+    scenes = list(dict.fromkeys(name.removesuffix("-plain") for name in names))
     rows = []
     for kind, models in LENS_MODELS.items():
         row, ratios = [kind], []
         for scene in scenes:
             for recorded in (kind, "plain"):
-                ends = [found[f"{scene}-{recorded}{name}", method] for name, method in models]
+                places = [(f"{scene}-{recorded}{name}", method) for name, method in models]
+                ends = of_one_program(runs, places)
                 row.append(" → ".join(pair(values, "psnr", "psnr_moving") for values in ends))
                 if recorded == "plain":
                     ratios.append(ends[1]["train_seconds"] / ends[0]["train_seconds"])
         rows.append([*row, number(statistics.fmean(ratios), 2)])
     heads = [f"`{scene}`{end}" for scene in scenes for end in (" with it", " without it")]
     return table(["effect", *heads, "training time"], rows)
+
+
+def of_one_program(
+    runs: Sequence[dict[str, Any]], places: Sequence[tuple[str, str]]
+) -> list[dict[str, float]]:
+    """The numbers of the latest runs at `places` (scene, method) that one commit
+    trained with as many threads: the times of others cannot be compared.
+    """
+    found: dict[tuple[str, int], dict[tuple[str, str], dict[str, float]]] = {}
+    for run in runs:
+        own = found.setdefault((run["commit"], run["threads"]), {})
+        own[run["scene"], run["method"]] = run["values"]
+    whole = [own for own in found.values() if own.keys() >= set(places)]
+    return [whole[-1][place] for place in places]
 
 
 def bench_rig(document: Document) -> Lines:

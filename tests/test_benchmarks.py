@@ -120,3 +120,13 @@ def test_the_clip_of_the_cost_benchmark_continues_backwards(record: ModuleType, 
     assert [frame.index for frame in frames] == [0, 1, 2, 3, 4, 5, 5, 4, 3]
     assert [frame.time for frame in frames] == list(range(9))
     assert frames[6].flow == {}
+
+
+def test_times_of_runs_with_other_threads_are_not_compared(record: ModuleType) -> None:
+    tables = importlib.import_module("result_tables")
+    keys = ("commit", "threads", "scene", "values")
+    found = [("a", 1, "plain", 30.0), ("a", 1, "plain-readout", 27.0), ("b", 2, "plain", 15.0)]
+    runs = [{"method": "splat", **dict(zip(keys, run, strict=True))} for run in found]
+    places = [("plain", "splat"), ("plain-readout", "splat")]
+    assert tables.of_one_program(runs, places) == [30.0, 27.0]
+    assert tables.of_one_program(runs, places[:1]) == [15.0]
