@@ -20,7 +20,7 @@ def origin(document: Document) -> str:
     machine = document["machine"]
     trained = dict.fromkeys(run["commit"] for run in document["results"] if run.get("commit"))
     commits = list(trained) or document.get("commits") or [document["commit"] or "unknown"]
-    commit = ", ".join(name[:9] for name in commits)
+    commit = ", ".join(shown_commit(name) for name in commits)
     changed = ", with changes" if document["dirty"] and not trained else ""
     day = document["date"][:10]
     note = f" {document['note']}" if "note" in document else ""
@@ -28,6 +28,11 @@ def origin(document: Document) -> str:
         f"*{machine['cores']} cores of {machine['cpu']}, torch {machine['torch']}, "
         f"commit {commit}{changed}, seed {document['seed']}, {day}.{note}*"
     )
+
+
+def shown_commit(name: str) -> str:
+    """A commit in nine letters, and whether files of the program had changed."""
+    return name[:9] + (" with changes" if name.endswith("-dirty") else "")
 
 
 def demo(document: Document) -> Lines:

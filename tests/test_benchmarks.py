@@ -130,3 +130,12 @@ def test_times_of_runs_with_other_threads_are_not_compared(record: ModuleType) -
     places = [("plain", "splat"), ("plain-readout", "splat")]
     assert tables.of_one_program(runs, places) == [30.0, 27.0]
     assert tables.of_one_program(runs, places[:1]) == [15.0]
+
+
+def test_a_run_of_changed_files_is_named_so_below_its_table(record: ModuleType) -> None:
+    tables = importlib.import_module("result_tables")
+    machine = {"cores": 2, "cpu": "EPYC", "torch": "2"}
+    runs = [{"commit": f"{'0' * 40}-dirty"}, {"commit": "1" * 40}]
+    document = {"machine": machine, "dirty": False, "seed": 0, "date": "2026", "results": runs}
+    line = tables.origin(document)
+    assert "commit 000000000 with changes, 111111111, seed 0" in line
