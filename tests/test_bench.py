@@ -163,6 +163,17 @@ def test_when_all_is_there_the_same_command_only_writes_the_tables(
     assert snapshot(finished) == before
 
 
+def test_a_run_that_was_evaluated_otherwise_is_measured_again(scenes: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    command = bench_words(out, scenes / "two/toy", f"a=tiny {SMALL}", "--views", 0)
+    assert call(*command) == 0
+    before = rows(out)["toy/a"]["psnr"]
+    assert call("evaluate", out / "runs/toy/a", "--device", "cpu") == 0  # on training views
+    assert call(*command, "--collect") == 1
+    assert call(*command) == 0
+    assert rows(out)["toy/a"]["psnr"] == before
+
+
 def test_lines_of_the_list_do_one_run_each(scenes: Path, tmp_path: Path, capsys: Capture) -> None:
     out = tmp_path / "a b"
     assert call(*on_both(scenes, out, METHODS, "--jobs", 2, "--list")) == 0

@@ -21,6 +21,7 @@ from hdr_nsff.bench.machine import this_machine
 from hdr_nsff.core import notes
 from hdr_nsff.core.checkpoints import latest_checkpoint
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.hashes import hash_file
 from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.notes import RunRecord, Trained
 from hdr_nsff.core.process import peak_memory
@@ -33,6 +34,7 @@ from hdr_nsff.scene.scene import Frame
 from hdr_nsff.training.run_folder import Run
 from hdr_nsff.training.train import train
 
+METRICS = "metrics.json"  # of `evaluate`, in the run folder
 LOG = "HDR_NSFF_BENCH_LOG"  # environment: the log file of this process
 TIMED_FRAMES = 5  # rendered to time a frame (hand-chosen)
 MAX_TIMING_S = 10.0  # seconds of rendering after which no further frame is timed (hand-chosen)
@@ -86,9 +88,17 @@ def measure_key(run: BenchRun, views: int, lpips: str | None) -> str:
 
 def is_complete(run: BenchRun, views: int, lpips: str | None) -> bool:
     """Whether nothing is left to do."""
-    if not run.scene.ready or not (run.folder / "metrics.json").is_file():
+    return run.scene.ready and is_measured(run, measure_key(run, views, lpips))
+
+
+def is_measured(run: BenchRun, key: str) -> bool:
+    """Whether the metrics.json of a run is the one that was written for `key`, and not
+    that of an `evaluate` of the user's.
+    """
+    record, path = read_record(run), run.folder / METRICS
+    if record.measured != key or not path.is_file():
         return False
-    return read_record(run).measured == measure_key(run, views, lpips)
+    return record.metrics in (None, hash_file(path))
 
 
 def train_run(run: BenchRun, views: int) -> None:
@@ -124,16 +134,17 @@ def train_run(run: BenchRun, views: int) -> None:
 def measure_run(run: BenchRun, views: int, lpips: str | None) -> None:
     """Evaluate the run, and its snapshots on a few views."""
     key = measure_key(run, views, lpips)
-    record = read_record(run)
-    if record.measured == key and (run.folder / "metrics.json").is_file():
+    if is_measured(run, key):
         return
+    record = read_record(run)
     start = time.monotonic()
     trained = Run.open(run.folder, run.config.device)
     truth = run.scene.truth
     evaluate_run(trained, truth, lpips)
     curve, shown = curve_of(trained, truth, views) if views else ([], [])
     seconds = round(time.monotonic() - start, 2)
-    update = {"measured": key, "seconds": seconds, "curve": curve, "shown": shown}
+    measured = {"measured": key, "metrics": hash_file(run.folder / METRICS), "seconds": seconds}
+    update = measured | {"curve": curve, "shown": shown}
     notes.write(run.record, record.model_copy(update=update))
 
 

@@ -215,6 +215,7 @@ class RunRecord(Note):
     scene_key: str  # of the scene folder it was trained on
     trained: Trained | None = None
     measured: str | None = None  # hash of the truth and the settings it was measured with
+    metrics: str | None = None  # hash of the metrics.json written then; None: unknown
     seconds: float = 0.0  # of measuring
     curve: list[CurvePoint] = []
     shown: list[ShownView] = []
