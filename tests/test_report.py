@@ -117,6 +117,17 @@ def test_the_report_counts_the_steps_of_the_run_and_not_of_its_log(
     assert "; step 64;" in text and "64 steps, 1,234 rays" in text and "59 steps" not in text
 
 
+def test_numbers_of_an_earlier_step_are_named_so(
+    finished: tuple[Run, Path], tmp_path: Path
+) -> None:
+    run, folder = finished
+    words = f"these numbers are of step {run.step}, the run is at step 64"
+    text, _ = read(write_report(run, folder / "report.html", folder / "render"))
+    assert words not in text
+    text, _ = read(write_report(replace(run, step=64), tmp_path / "report.html", tmp_path))
+    assert words in text
+
+
 def test_the_report_shows_what_was_given_and_estimated_with_names_escaped(
     finished: tuple[Run, Path],
 ) -> None:

@@ -277,6 +277,7 @@ Labels = dict[str, tuple[str, Digits]]  # score -> its label, and the digits to 
 class Metrics(Note):
     """`metrics.json`: the results of `evaluate`."""
 
+    step: int | None = None  # of the run that was measured
     kind: str
     notes: list[str]
     headline: Scores

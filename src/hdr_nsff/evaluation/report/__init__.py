@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import tyro
 
@@ -70,8 +71,7 @@ def write_report(run: Run, path: Path, renders: Path) -> Path:
     `renders`: the folder of the files of `render`.
     """
     check_place(path)
-    note = notes.read(run.folder / "metrics.json", notes.Metrics)
-    metrics = None if note is None else notes.to_dict(note)
+    metrics = metrics_of(run)
     log = run.log()
     source = run.scene.manifest.source
     page = render_page(
@@ -93,6 +93,21 @@ def write_report(run: Run, path: Path, renders: Path) -> Path:
     )
     write_text(path, page)
     return path
+
+
+def metrics_of(run: Run) -> dict[str, Any] | None:
+    """What `evaluate` has measured, noted where the run has gone on since; None before
+    it has run.
+    """
+    note = notes.read(run.folder / "metrics.json", notes.Metrics)
+    if note is None:
+        return None
+    metrics = notes.to_dict(note)
+    if note.step not in (None, run.step):
+        advice = "`hdr-nsff evaluate RUN` measures it again"
+        words = f"these numbers are of step {note.step}, the run is at step {run.step}; {advice}"
+        metrics["notes"] = [words, *note.notes]
+    return metrics
 
 
 def find_viewer(run: Run, folder: Path) -> str | None:
