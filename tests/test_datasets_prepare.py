@@ -112,6 +112,15 @@ def test_disparity_up_to_scale_and_shift_is_fitted_to_the_points() -> None:
     assert "1 of 1 maps by static points" in note
 
 
+def test_maps_that_shrink_are_read_at_the_centers_of_pixels(tmp_path: Path) -> None:
+    columns = np.tile(np.arange(9.0), (9, 1))
+    write_png(tmp_path / "mask.png", columns == 4)
+    np.save(tmp_path / "depth.npy", columns + 1)
+    moving = maps.moving_mask(tmp_path / "mask.png", (3, 3), True)
+    assert moving.tolist() == [[False, True, False]] * 3
+    assert maps.depth_map(tmp_path / "depth.npy", (3, 3), True)[0].tolist() == [2, 5, 8]
+
+
 def test_flow_that_is_not_valid_does_not_mix_into_resampled_flow(tmp_path: Path) -> None:
     valid = np.zeros((9, 12), bool)
     valid[:, :7] = True  # not a multiple of the two pixels that become one

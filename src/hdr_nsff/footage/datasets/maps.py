@@ -24,6 +24,7 @@ from hdr_nsff.footage.depth_files import ARRAYS, read_map
 from hdr_nsff.footage.flow_files import check_flow, read_npz
 from hdr_nsff.geometry.fill import fill
 
+NEAREST = cv2.INTER_NEAREST_EXACT  # by the centers of pixels; the other one shifts maps
 MAX_ASPECT_ERROR = 0.02  # by which the shape of a map may differ from the frames'
 MIN_POINTS = 20  # from which a scale and shift are fitted (hand-chosen)
 MAX_FAR = 3.0  # times the far bound: fitted disparity is clamped there (hand-chosen)
@@ -53,7 +54,7 @@ def fit_size(
 
 def fit_mask(path: Path, mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """A mask (h, w) bool at `size` (H, W), by the nearest pixel."""
-    return fit_size(path, mask.astype(np.uint8), size, cv2.INTER_NEAREST) > 0
+    return fit_size(path, mask.astype(np.uint8), size, NEAREST) > 0
 
 
 def moving_mask(path: Path, size: tuple[int, int], white_moves: bool) -> np.ndarray:
@@ -97,7 +98,7 @@ def depth_map(path: Path, size: tuple[int, int], is_metric: bool) -> np.ndarray:
         )
     if not np.isfinite(values).all():
         raise InputError(f"{path}: the depth map holds NaN or Inf; write 0 where depth is unknown")
-    return fit_size(path, values, size, cv2.INTER_NEAREST)
+    return fit_size(path, values, size, NEAREST)
 
 
 # Depth of all pictures in units of the poses
