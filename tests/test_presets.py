@@ -14,6 +14,8 @@ from hdr_nsff.fields.build import build_field, initialize_field
 from hdr_nsff.fields.point_cloud import MAX_SIGMOID_RADIANCE
 from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.splat import Splat
+from hdr_nsff.geometry.cameras import Camera
+from hdr_nsff.maths import volume
 from hdr_nsff.scene.batch import whole_frame
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.base import ToneMapConfig
@@ -115,6 +117,38 @@ def test_layers_are_in_bfloat16_where_the_device_computes_in_it(
         layer.register_forward_hook(lambda module, given, made: types.add(made.dtype))
     t.step()
     assert layers and types == {torch.bfloat16 if fast else torch.float32}
+
+
+@pytest.mark.parametrize("name", ["paper-small", "hdr-hexplane"])
+def test_geometry_and_compositing_stay_in_float32_beside_layers_in_bfloat16(
+    toy: Scene, toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.setattr("hdr_nsff.training.train.computes_bf16_fast", lambda device: True)
+    config = replace(small(name, toy_folder, tmp_path / "run"), bf16=True)
+    t = trainer(config, toy)
+    seen: dict[str, set[torch.dtype]] = {}
+
+    def watch(owner: Any, function: str) -> None:
+        inner = getattr(owner, function)
+
+        def watched(*args: Any, **kwargs: Any) -> Any:
+            made = inner(*args, **kwargs)
+            parts = made if isinstance(made, tuple) else (getattr(made, "directions", made),)
+            seen.setdefault(function, set()).update(part.dtype for part in parts)
+            return made
+
+        monkeypatch.setattr(owner, function, watched)
+
+    watch(Camera, "rays")
+    watch(Camera, "project")
+    watch(type(t.field.space), "encode")
+    watch(type(t.field.space), "decode")
+    watch(volume, "weighted_sum")
+    watch(volume, "alpha_from_density")
+    t.step()
+    assert {"rays", "encode", "alpha_from_density"} <= set(seen)
+    assert name != "paper-small" or {"project", "decode", "weighted_sum"} <= set(seen)
+    assert all(types == {torch.float32} for types in seen.values()), seen
 
 
 def test_a_grid_does_not_start_from_depth_without_units(toy: Scene) -> None:

@@ -82,6 +82,13 @@ def computes_bf16_fast(device: torch.device) -> bool:
     return device.type == "cpu" and torch.cpu._is_avx512_bf16_supported()
 
 
+def layers_in_bf16(like: Tensor, enabled: bool) -> torch.autocast:
+    """A context for network layers alone, on the device of `like`: in bfloat16 where
+    that is `enabled`. Geometry stays outside: bfloat16 would move rays by a pixel.
+    """
+    return torch.autocast(like.device.type, torch.bfloat16, enabled=enabled)
+
+
 def generator_for(device: torch.device, seed: int) -> torch.Generator:
     """A generator that draws for `device`: on CUDA there, elsewhere on the CPU.
 

@@ -21,7 +21,9 @@ from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.process import limit_torch_threads
 from hdr_nsff.core.tensors import computes_bf16_fast, to_device
 from hdr_nsff.fields.base import FrameError
+from hdr_nsff.fields.baselines.hexplane import HexPlane
 from hdr_nsff.fields.build import build_field, check_scene, device_for
+from hdr_nsff.fields.nsff.two_branches import TwoBranches
 from hdr_nsff.scene.batch import PixelBatch
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.build import tone_mapper_for
@@ -115,6 +117,8 @@ class Trainer:
         self.bf16 = config.bf16 and computes_bf16_fast(device)
         if config.bf16 and not self.bf16:
             self.writer.say("layers in float32: this device would take longer in bfloat16")
+        if isinstance(self.field, TwoBranches | HexPlane):  # the others have no layers
+            self.field.bf16 = self.bf16
         self.clock = self.writer.resume(self.clock) or self.clock
         # frames on the CPU stay where they are: read when they are drawn
         self.scene = scene if device.type == "cpu" else to_device(scene, device)
@@ -161,8 +165,7 @@ class Trainer:
         for slot in slots:
             batch = self.poses(self.draw(slot))
             self.read_ahead(draw_frame(config, self.scene, clock.step + 1, slot)[0])
-            with torch.autocast(batch.rgb.device.type, torch.bfloat16, enabled=self.bf16):
-                render, field_terms = self.field(batch)
+            render, field_terms = self.field(batch)
             terms = self.objective.terms(render, batch, self.tonemapper, clock.phase)
             terms |= self.objective.reduce(field_terms) | self.tonemapper.regularizers()
             terms |= self.poses.regularizers(batch.frame)

@@ -28,7 +28,7 @@ from torch import Tensor, nn
 
 from hdr_nsff.core.param_group import ParamGroup
 from hdr_nsff.core.settings import Advanced, Count, Number, Rate, Share, Weight
-from hdr_nsff.core.tensors import generator_for
+from hdr_nsff.core.tensors import generator_for, layers_in_bf16
 from hdr_nsff.fields.base import FrameError, Render
 from hdr_nsff.fields.baselines.planes import Planes
 from hdr_nsff.fields.knots import knot_of
@@ -105,6 +105,7 @@ class HexPlane(nn.Module):
     times: Tensor
     bias: Tensor
     steps: Tensor
+    bf16 = False  # whether the networks compute in bfloat16 while training
 
     def __init__(
         self, config: HexPlaneConfig, space: Space, times: Tensor, near: float, far: float
@@ -178,7 +179,9 @@ class HexPlane(nn.Module):
 
     def density(self, coords: Tensor, share: float) -> Tensor:
         """Density (M,) per cube side at `coords` (M, 3) and a share of the clip."""
-        raw = self.to_density(self.density_planes(coords, share))[:, 0]
+        features = self.density_planes(coords, share)
+        with layers_in_bf16(coords, self.bf16 and self.training):
+            raw = self.to_density(features)[:, 0].float()
         return DENSITY_SCALE * nn.functional.softplus(raw - self.config.emptiness)
 
     def radiance(self, coords: Tensor, directions: Tensor, share: float) -> Tensor:
@@ -186,9 +189,11 @@ class HexPlane(nn.Module):
 
         `directions` (M, 3) are unit view directions.
         """
-        features = self.to_features(self.appearance_planes(coords, share))
-        inputs = [frequencies(features, OCTAVES), frequencies(directions, OCTAVES)]
-        log_radiance = self.color(torch.cat(inputs, -1)) + self.bias
+        features = self.appearance_planes(coords, share)
+        with layers_in_bf16(coords, self.bf16 and self.training):
+            features = self.to_features(features).float()
+            inputs = [frequencies(features, OCTAVES), frequencies(directions, OCTAVES)]
+            log_radiance = self.color(torch.cat(inputs, -1)).float() + self.bias
         return log_radiance.clamp(max=MAX_LOG_RADIANCE).exp()
 
     def forward(self, batch: PixelBatch) -> tuple[Render, dict[str, Tensor]]:

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from hdr_nsff.core.param_group import ParamGroup
 from hdr_nsff.core.settings import Advanced, Number, Share, Weight
-from hdr_nsff.core.tensors import generator_for
+from hdr_nsff.core.tensors import generator_for, layers_in_bf16
 from hdr_nsff.fields.base import FrameError
 from hdr_nsff.fields.knots import knot_of
 from hdr_nsff.fields.nsff.branches import (
@@ -121,6 +121,7 @@ class TwoBranches(nn.Module):
     bias: Tensor
     config: BranchesConfig
     branches: Branches
+    bf16 = False  # whether the branches compute in bfloat16 while training
 
     def __init__(
         self,
@@ -208,8 +209,10 @@ class TwoBranches(nn.Module):
         """The static branch at the samples `keep` (N, S) bool; empty elsewhere."""
         index = keep.reshape(-1).nonzero()[:, 0]
         coords = samples.coords.reshape(-1, 3)[index]
-        raw = self.branches.static(coords, self.view_directions(samples, index))
-        return self.scatter(raw, index, keep.shape, self.density_bias(static=True))
+        directions = self.view_directions(samples, index)
+        with layers_in_bf16(coords, self.bf16 and self.training):
+            raw = self.branches.static(coords, directions)
+        return self.scatter(raw.float(), index, keep.shape, self.density_bias(static=True))
 
     def query_dynamic(
         self,
@@ -224,14 +227,15 @@ class TwoBranches(nn.Module):
 
         The coordinates are those of samples `index` (M,) of rays of `shape` (N, S).
         """
-        raw, raw_motion = self.branches.dynamic(coords, knot, directions, motion)
-        return self.scatter(raw, index, shape, self.density_bias(static=False)), raw_motion
+        with layers_in_bf16(coords, self.bf16 and self.training):
+            raw, raw_motion = self.branches.dynamic(coords, knot, directions, motion)
+        content = self.scatter(raw.float(), index, shape, self.density_bias(static=False))
+        return content, None if raw_motion is None else raw_motion.float()
 
     def scatter(self, raw: Tensor, index: Tensor, shape: torch.Size, bias: float) -> BranchOutput:
         """Raw numbers (M, 4 or 5) of samples `index`, as rays of `shape` (N, S)."""
 
         def everywhere(values: Tensor) -> Tensor:
-            # autocast may have made other types of the raw numbers, by device
             found = values.new_zeros(shape[0] * shape[1], *values.shape[1:])
             return found.index_copy(0, index, values).view(*shape, *values.shape[1:])
 
