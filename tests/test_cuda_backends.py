@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from hdr_nsff import cli
+from hdr_nsff.core import tensors
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.fields import build
 from hdr_nsff.fields.build import device_for
@@ -105,6 +106,7 @@ def broken_cuda(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     said: list[str] = []
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    monkeypatch.setattr(tensors, "cuda_fault", lambda name: None)
     monkeypatch.setattr(cuda_backends, "fault", lambda device="cuda": "nothing draws")
     monkeypatch.setattr(build, "say", said.append)
     return said

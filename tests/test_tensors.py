@@ -6,8 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from hdr_nsff.core import tensors
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.tensors import generator_for, pick_device, tree_map
+from hdr_nsff.core.tensors import cuda_fault, generator_for, pick_device, tree_map
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,7 @@ def with_cuda_devices(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
     """A torch that reports `count` CUDA devices."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: count > 0)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: count)
+    monkeypatch.setattr(tensors, "cuda_fault", lambda name: None)
 
 
 def test_auto_is_cuda_where_there_is_a_device(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -63,6 +65,27 @@ def test_a_cuda_device_that_is_not_there_is_an_error(
     with_cuda_devices(monkeypatch, count)
     with pytest.raises(InputError, match=f"--device {name}: .*{reason}"):
         pick_device(name)
+
+
+def test_a_cuda_device_on_which_torch_computes_nothing_is_not_taken(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with_cuda_devices(monkeypatch, 1)
+    monkeypatch.setattr(tensors, "cuda_fault", cuda_fault)
+
+    def too_old(*size: int, device: str) -> Tensor:
+        raise RuntimeError("CUDA error: no kernel image is available\nCompile with ...")
+
+    monkeypatch.setattr(torch, "ones", too_old)
+    for cached in (cuda_fault, tensors.say_once):
+        cached.cache_clear()
+    assert pick_device("auto") == pick_device("auto") == torch.device("cpu")
+    said = capsys.readouterr().err
+    assert said.count("using the CPU although there is a CUDA device: CUDA error: no kernel") == 1
+    with pytest.raises(InputError, match=r"--device cuda:0: .*no kernel image is available\);"):
+        pick_device("cuda:0")
+    for cached in (cuda_fault, tensors.say_once):
+        cached.cache_clear()
 
 
 NAMES = ["mps", "hip", "xla", "meta", "privateuseone", "gpu7", "", "cuda:", "cuda:-1", "cuda:x"]

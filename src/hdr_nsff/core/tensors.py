@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.progress import say
 
 T = TypeVar("T")
 
@@ -98,12 +99,37 @@ def generator_for(device: torch.device, seed: int) -> torch.Generator:
     return torch.Generator(device if device.type == "cuda" else CPU).manual_seed(seed)
 
 
+@cache
+def cuda_fault(name: str) -> str | None:
+    """Why torch computes nothing on a CUDA device that it sees, such as one too old for
+    this torch; None where it does.
+    """
+    try:
+        torch.ones(2, device=name).sum().item()
+    except RuntimeError as error:
+        return f"{str(error).strip().partition(chr(10))[0]:.120}"
+    return None
+
+
+@cache
+def say_once(message: str) -> None:
+    """Print a line, the first time that it is to be said."""
+    say(message)
+
+
 def pick_device(name: str) -> torch.device:
     """The device of a `--device` flag: auto, cpu, cuda or cuda:N. InputError for any
-    other name, and for a CUDA device that is not there.
+    other name, and for a CUDA device that is not there or computes nothing; auto then
+    says why it takes the CPU.
     """
     if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        if not torch.cuda.is_available():
+            return CPU
+        reason = cuda_fault("cuda")
+        if reason is None:
+            return torch.device("cuda")
+        say_once(f"--device auto: using the CPU although there is a CUDA device: {reason}")
+        return CPU
     if name == "cpu":
         return CPU
     match = re.fullmatch(r"cuda(?::(\d{1,3}))?", name, re.ASCII)
@@ -118,4 +144,7 @@ def pick_device(name: str) -> torch.device:
         raise InputError(
             f"--device {name}: no such CUDA device; there are {count}, counted from cuda:0"
         )
+    reason = cuda_fault(name)
+    if reason is not None:
+        raise InputError(f"--device {name}: torch computes nothing there ({reason}); take the CPU")
     return torch.device(name)
