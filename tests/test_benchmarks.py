@@ -9,6 +9,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+import torch
 from bad_input import poses
 
 from hdr_nsff.scene.scene import Scene
@@ -139,3 +140,13 @@ def test_a_run_of_changed_files_is_named_so_below_its_table(record: ModuleType) 
     document = {"machine": machine, "dirty": False, "seed": 0, "date": "2026", "results": runs}
     line = tables.origin(document)
     assert "commit 000000000 with changes, 111111111, seed 0" in line
+
+
+def test_where_nothing_draws_on_the_gpu_no_twins_are_compared(
+    record: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gpu = load("gpu")
+    nothing = gpu.cuda_backends.Backend(None, "no compiler", "no compiler")
+    monkeypatch.setattr(gpu.cuda_backends, "find_backend", lambda device: nothing)
+    found = gpu.compare_twins(torch.device("cuda"))
+    assert found == {"error": "nothing draws Gaussians on the GPU: no compiler"}
