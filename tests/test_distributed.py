@@ -9,8 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
+import torch.distributed as dist
 from presets import small
 
+from hdr_nsff.core import distributed
+from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import write_json
 from hdr_nsff.training.run_folder import Run
 
@@ -66,3 +70,26 @@ def test_the_first_process_decides_what_is_relocated(
         return
     assert result.returncode == 0, result.stderr[-3000:]
     assert Run.open(tmp_path / "run").step == 12
+
+
+def test_processes_take_a_cuda_device_each_unless_they_train_on_the_cpu(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    joined: list[str] = []
+    monkeypatch.setattr(dist, "init_process_group", joined.append)
+    for name in ("barrier", "destroy_process_group"):
+        monkeypatch.setattr(dist, name, lambda: None)
+    monkeypatch.setattr(dist, "get_rank", lambda: 1)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    monkeypatch.setattr(torch.cuda, "set_device", lambda index: joined.append(f"cuda:{index}"))
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    with distributed.group("cpu") as ranks:
+        assert (ranks.rank, ranks.world, joined) == (1, 2, ["gloo"])
+    too_few = pytest.raises(InputError, match="1 CUDA devices are too few for process 2")
+    with too_few, distributed.group("auto"):
+        pass
+    monkeypatch.setenv("LOCAL_RANK", "0")
+    with distributed.group("cuda"):
+        assert joined == ["gloo", "cuda:0", "cpu:gloo,cuda:nccl"]

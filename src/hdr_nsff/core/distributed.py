@@ -17,6 +17,8 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
+from hdr_nsff.core.errors import InputError
+
 
 @dataclass(frozen=True)
 class Ranks:
@@ -77,17 +79,24 @@ class Ranks:
 
 
 @contextmanager
-def group() -> Iterator[Ranks]:
+def group(device: str = "auto") -> Iterator[Ranks]:
     """Join the other processes where `torchrun` started several, and leave in order at
-    the end.
+    the end. Each takes a CUDA device of its own, unless `device` is the CPU; InputError
+    where there are too few.
     """
     world = int(os.environ.get("WORLD_SIZE", "1"))
     if world == 1:
         yield Ranks()
         return
-    if torch.cuda.is_available():
+    if device != "cpu" and torch.cuda.is_available():
+        own, count = int(os.environ.get("LOCAL_RANK", "0")), torch.cuda.device_count()
+        if own >= count:
+            raise InputError(
+                f"{count} CUDA devices are too few for process {own + 1} on this machine; "
+                "start one process for each, or train with --device cpu"
+            )
+        torch.cuda.set_device(own)
         dist.init_process_group("cpu:gloo,cuda:nccl")
-        torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")))
     else:
         dist.init_process_group("gloo")
     try:

@@ -52,7 +52,7 @@ def train(config: TrainConfig, keep_at: Sequence[float] = (), previews: bool = T
     checkpoint.
     """
     config = check_config(config)
-    with writing_to(config.out), lock_output(config.out), distributed.group() as ranks:
+    with writing_to(config.out), lock_output(config.out), distributed.group(config.device) as ranks:
         if ranks.world > config.batches:
             raise InputError(
                 f"{ranks.world} processes share {config.batches} batches per step; "
