@@ -150,3 +150,10 @@ def test_where_nothing_draws_on_the_gpu_no_twins_are_compared(
     monkeypatch.setattr(gpu.cuda_backends, "find_backend", lambda device: nothing)
     found = gpu.compare_twins(torch.device("cuda"))
     assert found == {"error": "nothing draws Gaussians on the GPU: no compiler"}
+
+
+def test_a_difference_that_is_not_a_number_is_an_error(record: ModuleType) -> None:
+    gpu = load("gpu")
+    error = gpu.relative_error(torch.tensor([1.0, torch.nan]), torch.ones(2))
+    assert not gpu.within(0.1, {"means": error, "maps": 0.0})
+    assert gpu.within(0.1, {"means": gpu.relative_error(torch.zeros(2), torch.zeros(2))})
