@@ -18,6 +18,7 @@ from hdr_nsff.radiometry.exposure_cycle import (
     reference_bracket,
     share_brackets,
     value_ranks,
+    without_cycle,
 )
 
 
@@ -209,3 +210,9 @@ def test_ranks_count_ties_half():
     value, rank = value_ranks(np.array([0.0, 0.0, 1023 / 1023 * 0.5, 0.5]))
     assert np.allclose(rank, [0.25, 0.75])
     assert np.allclose(value, [0, 0.5], atol=1e-3)
+
+
+def test_a_short_clip_is_not_said_to_have_no_cycle_that_it_is_too_short_to_show():
+    assert "3 frames are too few to show a cycle" in without_cycle(2.0, 3)
+    assert "no cycle of up to 3 frames" in without_cycle(2.0, 7)
+    assert "no cycle of up to 6 frames" in without_cycle(2.0, 40)

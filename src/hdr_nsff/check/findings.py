@@ -12,7 +12,7 @@ from hdr_nsff.footage.footage import INTERLACED, deinterlacing
 from hdr_nsff.prepare.length import offered_segments
 from hdr_nsff.prepare.work import PrepareConfig
 from hdr_nsff.radiometry.camera_brackets import MIN_CAMERA_STEP_EV
-from hdr_nsff.radiometry.exposure_cycle import MAX_CYCLE, MIN_STEP
+from hdr_nsff.radiometry.exposure_cycle import MIN_STEP, without_cycle
 
 Level = Literal["good", "note", "warning", "problem"]
 
@@ -112,10 +112,7 @@ def judge_exposure(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]
         )
         yield Finding("good", "exposure", text)
     elif exposure.change_ev > MIN_STEP:
-        text = (
-            f"brightness changes by {exposure.change_ev:.1f} EV from frame to frame, but in "
-            f"no cycle of up to {MAX_CYCLE} frames"
-        )
+        text = without_cycle(exposure.change_ev, facts.looked_at)
         yield Finding("warning", "exposure", text, "list the exposures in exposures.csv")
     else:
         text = "the exposure does not alternate, so light beyond its white is not recorded"

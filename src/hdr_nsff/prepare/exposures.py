@@ -376,12 +376,12 @@ def cycle_notes(work: Work, cycles: list[exposure.Cycle], group: list[int]) -> l
         if len(cycles) > 1:
             camera = f"camera {work.manifest.frames[frames[0]].camera_id}: "
         steps = exposure.brightness_steps(work.video[frames])
-        notes.append(camera + cycle_note(cycle, float(np.abs(steps).mean())))
+        notes.append(camera + cycle_note(cycle, steps))
     return notes
 
 
-def cycle_note(cycle: exposure.Cycle, change: float) -> str:
-    """A sentence on a cycle; `change` is the mean EV from frame to frame."""
+def cycle_note(cycle: exposure.Cycle, steps: np.ndarray) -> str:
+    """A sentence on a cycle; `steps` (T-1,) are the EV from frame to frame."""
     if cycle.length > 1:
         first = [cycle.brackets.index(b) for b in cycle.order]
         levels = ", ".join(f"{cycle.ev[b]:.1f}" for b in cycle.order)
@@ -390,11 +390,10 @@ def cycle_note(cycle: exposure.Cycle, change: float) -> str:
             f"of the cycle, about {levels} EV (gamma 2.2); this explains "
             f"{cycle.confidence:.0%} of its changes"
         )
+    change = float(np.abs(steps).mean())
     if change > exposure.MIN_STEP:
-        return (
-            f"brightness changes by {change:.1f} EV from frame to frame, but in no cycle of up "
-            f"to {exposure.MAX_CYCLE} frames; list the exposures in a CSV if they were set"
-        )
+        found = exposure.without_cycle(change, len(steps) + 1)
+        return f"{found}; give --ev or list the exposures in a CSV if they were set"
     return (
         "no alternation of exposures found; treated as an ordinary clip of one exposure, "
         "unless static points show that it drifts"

@@ -20,6 +20,7 @@ from hdr_nsff.radiometry.exposure_cycle import (
     cycle_of_steps,
     fit_cycle,
     information_criterion,
+    longest_cycle,
     share_brackets,
 )
 
@@ -82,8 +83,7 @@ def find_cycle(
     if without_gaps:
         lowest = criterion(fit_cycle(steps, plain.length, tuning.cycle)[0], plain.length, 0, count)
     misfit_without = fit_cycle(steps, 1, tuning.cycle)[0]
-    longest = min(tuning.cycle.max_cycle, (count + 1) // 2)
-    for length in range(2, longest + 1):
+    for length in range(2, longest_cycle(count + 1, tuning.cycle) + 1):
         phases, levels = fit_phases(steps, known, length, tuning)
         if len(np.unique(phases)) < length:
             continue  # an exposure that no frame has

@@ -142,8 +142,7 @@ def detect_cycle(video: ArrayStack, tuning: ExposureCycleTuning = ExposureCycleT
 def cycle_of_steps(steps: np.ndarray, tuning: ExposureCycleTuning = ExposureCycleTuning()) -> Cycle:
     """The exposure cycle of EV `steps` (T-1,) between frames, as `detect_cycle`."""
     count = len(steps)
-    longest = min(tuning.max_cycle, (count + 1) // 2)
-    lengths = range(1, max(1, longest) + 1)
+    lengths = range(1, longest_cycle(count + 1, tuning) + 1)
     fits = {length: fit_cycle(steps, length, tuning) for length in lengths}
 
     length = min(lengths, key=lambda n: information_criterion(fits[n][0], count, n - 1))
@@ -162,6 +161,20 @@ def cycle_of_steps(steps: np.ndarray, tuning: ExposureCycleTuning = ExposureCycl
         ev=ev,
         confidence=1 - misfit / misfit_without,
     )
+
+
+def longest_cycle(num_frames: int, tuning: ExposureCycleTuning = ExposureCycleTuning()) -> int:
+    """The longest cycle looked for in so many frames: they must show it twice."""
+    return max(1, min(tuning.max_cycle, num_frames // 2))
+
+
+def without_cycle(change: float, num_frames: int) -> str:
+    """A sentence on frames whose brightness changes by `change` EV in no cycle."""
+    text = f"brightness changes by {change:.1f} EV from frame to frame, but "
+    longest = longest_cycle(num_frames)
+    if longest == 1:
+        return text + f"{num_frames} frames are too few to show a cycle"
+    return text + f"in no cycle of up to {longest} frames"
 
 
 def information_criterion(misfit: float, count: int, parameters: int) -> float:
