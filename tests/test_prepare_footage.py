@@ -189,3 +189,15 @@ def test_a_mask_of_another_size_is_named_with_the_way_out(tmp_path: Path) -> Non
         write_png(work.folder / f.mask, np.zeros((24, 32 + (f.index == 4), 3)))
     with pytest.raises(InputError, match=r"4\.png: the mask is 33x24, the frames are 32x24.*redo"):
         _ = work.masks
+
+
+def test_frames_that_are_black_or_white_all_over_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    video = clip([-2, 0], frames=12)
+    work_on(tmp_path / "whole", video)
+    assert "all over" not in capsys.readouterr().err
+    video[:3], video[11] = 0, 1
+    work_on(tmp_path / "faded", video)
+    said = capsys.readouterr().err
+    assert "of the 12 frames used, counted from 0, 0-2 black all over and 11 white all over" in said

@@ -17,6 +17,7 @@ from hdr_nsff.footage.frame_choice import check_frame_size
 from hdr_nsff.footage.hold_out import HOLD_OUT, frames_between, hold_out_every
 from hdr_nsff.footage.ingest import read_frames
 from hdr_nsff.footage.turns import find_cameras_in_turn
+from hdr_nsff.geometry.poses import format_ranges
 from hdr_nsff.prepare.exposure_times import exposure_times
 from hdr_nsff.prepare.exposures import frame_exposures
 from hdr_nsff.prepare.length import offered_segments
@@ -71,6 +72,9 @@ def frames_step(work: Work) -> StepResult:
         seconds.append(frame.seconds)
         extents.append(exposure.extent(frame.rgb))
     check_frames(c.clip, entries, extents)
+    empty = empty_frames(extents)
+    if empty:
+        say(f"frames: {empty}")
     if work.footage.video:
         check_lengths(c.clip, entries)
     m.frame_seconds = frame_seconds(work, entries, seconds)
@@ -149,6 +153,24 @@ def check_frames(clip: Path, entries: list[FrameEntry], extents: list[tuple[floa
         raise InputError(
             f"{clip}: all frames are {color}; nothing can be learned from them, choose other frames"
         )
+
+
+def empty_frames(extents: list[tuple[float, float]]) -> str:
+    """A sentence on the frames that are black or white all over, "" without any;
+    `extents` as for `check_frames`.
+    """
+    colors = [exposure.all_clipped([extent]) for extent in extents]
+    found = []
+    for color in ("black", "white"):
+        numbers = [i for i, own in enumerate(colors) if own == color]
+        if numbers:
+            found.append(f"{format_ranges(numbers)} {color} all over")
+    if not found:
+        return ""
+    return (
+        f"of the {len(extents)} frames used, counted from 0, {' and '.join(found)}; where that is "
+        "no exposure of the cycle, leave them out (--start, --end): they hide the cycle"
+    )
 
 
 def check_lengths(clip: Path, entries: list[FrameEntry]) -> None:
