@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hdr_nsff.footage.hold_out import hold_out_every, hold_out_spacing
+from hdr_nsff.footage.hold_out import hold_out_every, hold_out_spacing, widest_hold_out
 
 
 def test_held_out_frames_cover_all_exposures():
@@ -31,3 +31,12 @@ def test_unevenly_spaced_frames_have_no_spacing() -> None:
     assert hold_out_spacing([0, 8]) is None
     assert hold_out_spacing([4, 8]) is None
     assert hold_out_spacing([1, 2, 4]) is None
+
+
+@pytest.mark.parametrize("cycle", [1, 2, 3])
+def test_the_spacing_that_is_advised_holds_something_out(cycle: int) -> None:
+    for count in range(4, 12):
+        every = widest_hold_out(count, cycle)
+        assert every is not None and hold_out_every(count, every, cycle)
+    assert hold_out_every(5, 8, 2) == [] and widest_hold_out(5, 2) == 7
+    assert widest_hold_out(100, cycle) == 8 and widest_hold_out(2, cycle) is None

@@ -18,6 +18,7 @@ from torch import Tensor
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import read_mask
 from hdr_nsff.core.progress import say
+from hdr_nsff.footage.hold_out import widest_hold_out
 from hdr_nsff.geometry import alignment
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.geometry.lens import undistorted_picture
@@ -116,11 +117,13 @@ def choose_targets(
         return kind, targets, notes
     if run.scene.test:
         return "held-out frames", frame_targets(run.scene.test, "held-out frame"), []
-    advice = "nothing was held out (`prepare --hold-out 8` does that)"
-    note = f"{advice}: these numbers are of frames the field was trained on"
+    manifest = run.scene.manifest
+    every = widest_hold_out(len({frame.time for frame in manifest.frames}), manifest.cycle)
+    advice = f" (`prepare --hold-out {every}` does that)" if every else ""
+    note = f"nothing was held out{advice}: these numbers are of frames the field was trained on"
     say(note)
     stride = max(1, -(-len(run.scene.train) // MAX_TRAINING_VIEWS))
-    while math.gcd(stride, run.scene.manifest.cycle) > 1:  # all exposures, in turn
+    while math.gcd(stride, manifest.cycle) > 1:  # all exposures, in turn
         stride += 1
     frames = run.scene.train[::stride]
     return "training views (not held out)", frame_targets(frames, TRAINED_ON), [note]

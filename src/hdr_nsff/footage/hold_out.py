@@ -23,6 +23,12 @@ def hold_out_every(count: int, every: int, cycle: int, removed: bool = False) ->
     return list(range(every // 2, count - 1, every))
 
 
+def widest_hold_out(count: int, cycle: int) -> int | None:
+    """The largest `every` up to HOLD_OUT that holds out any of `count` frames."""
+    fitting = (n for n in range(HOLD_OUT, 1, -1) if hold_out_every(count, n, cycle))
+    return next(fitting, None)
+
+
 def hold_out_spacing(frames: Sequence[int]) -> int | None:
     """The smallest `every` for which `hold_out_every` gives just these `frames`.
 
