@@ -260,6 +260,16 @@ def test_a_good_clip_has_nothing_to_warn_of() -> None:
     assert {finding.level for finding in judge(good_facts())} <= {"good", "note"}
 
 
+def test_black_frames_that_hide_the_cycle_are_named_and_are_no_auto_exposure(
+    tmp_path: Path,
+) -> None:
+    evs = [-20.0] * 3 + [0.0, -3.0] * 3
+    facts, _, _ = measured(clip_of(tmp_path, still_scene, evs))
+    found = judge(replace(facts, exposure=replace(facts.exposure, drift_ev=3.0)))
+    assert any("of 9 frames, counted from 0, 0-2 black all over" in f.text for f in found)
+    assert facts.exposure.cycle == 1 and not any("auto exposure" in f.text for f in found)
+
+
 def test_an_interlaced_clip_is_told_how_to_be_made_progressive() -> None:
     good = good_facts()
     interlaced = replace(good, file=replace(good.file, interlaced=True))

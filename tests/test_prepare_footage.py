@@ -200,4 +200,4 @@ def test_frames_that_are_black_or_white_all_over_are_named(
     video[:3], video[11] = 0, 1
     work_on(tmp_path / "faded", video)
     said = capsys.readouterr().err
-    assert "of the 12 frames used, counted from 0, 0-2 black all over and 11 white all over" in said
+    assert "of 12 frames, counted from 0, 0-2 black all over and 11 white all over" in said

@@ -46,6 +46,7 @@ class ExposureFacts:
     banding_ev: float  # amplitude of bright and dark bands, 0 where there are none
     color_drift_ev: float = 0.0  # the same of red or blue against green
     missing_before: tuple[int, ...] = ()  # frames before which the cycle skips some
+    empty: str = ""  # which frames are black or white all over, a sentence
     given_drift_ev: float = 0.0  # range by which given exposures leave their cycle
     contradictions: tuple[str, ...] = ()  # of given exposures and pixels, sentences
 

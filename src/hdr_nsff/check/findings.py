@@ -122,7 +122,11 @@ def judge_exposure(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]
     if widest > tuning.max_step_ev:
         text = f"two exposures are {widest:.1f} EV apart and share few mid-tones"
         yield Finding("warning", "exposure", text, "use steps of 1 to 3 EV, or a third exposure")
-    if exposure.drift_ev > tuning.max_drift_ev and exposure.given is None:
+    if exposure.empty:
+        advice = "leave them out (--start, --end) if they are no exposure of the cycle"
+        yield Finding("warning", "exposure", exposure.empty, advice)
+    jumping = exposure.cycle == 1 and exposure.change_ev > MIN_STEP  # said above
+    if exposure.drift_ev > tuning.max_drift_ev and exposure.given is None and not jumping:
         text = f"the exposure drifts by about {exposure.drift_ev:.1f} EV: auto exposure"
         advice = "`prepare` follows it, but lock exposure and white balance if you can"
         yield Finding("warning", "exposure", text, advice)

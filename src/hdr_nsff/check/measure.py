@@ -24,6 +24,7 @@ from hdr_nsff.footage.cuts import find_cuts
 from hdr_nsff.footage.footage import Footage
 from hdr_nsff.footage.frame_choice import check_frame_size
 from hdr_nsff.footage.ingest import read_frames
+from hdr_nsff.prepare.steps.footage import empty_frames
 from hdr_nsff.priors.poses.estimate import PosesTuning, believed_share, shaken_poses
 from hdr_nsff.priors.poses.matching import (
     Keypoints,
@@ -138,6 +139,7 @@ def measure_exposure(
         given=None if given is None else given.source,
         given_drift_ev=0.0 if given is None else round(given.drift(), 2),
         contradictions=tuple(contradictions),
+        empty=empty_frames([exposure.extent(picture) for picture in video]),
         change_ev=round(float(np.abs(steps).mean()), 3),
         drift_ev=round(drift.exposure_ev, 2),
         color_drift_ev=round(drift.color_ev, 2),

@@ -74,7 +74,9 @@ def frames_step(work: Work) -> StepResult:
     check_frames(c.clip, entries, extents)
     empty = empty_frames(extents)
     if empty:
-        say(f"frames: {empty}")
+        say(
+            f"frames: {empty}; leave them out (--start, --end) if they are no exposure of the cycle"
+        )
     if work.footage.video:
         check_lengths(c.clip, entries)
     m.frame_seconds = frame_seconds(work, entries, seconds)
@@ -167,10 +169,7 @@ def empty_frames(extents: list[tuple[float, float]]) -> str:
             found.append(f"{format_ranges(numbers)} {color} all over")
     if not found:
         return ""
-    return (
-        f"of the {len(extents)} frames used, counted from 0, {' and '.join(found)}; where that is "
-        "no exposure of the cycle, leave them out (--start, --end): they hide the cycle"
-    )
+    return f"of {len(extents)} frames, counted from 0, {' and '.join(found)}, which hides a cycle"
 
 
 def check_lengths(clip: Path, entries: list[FrameEntry]) -> None:
