@@ -20,7 +20,7 @@ from hdr_nsff.core.images import read_image, read_mask, write_png
 from hdr_nsff.core.io import write_npy
 from hdr_nsff.geometry.round_trip import round_trip
 from hdr_nsff.prepare.prepare import STEPS, PrepareConfig, prepare
-from hdr_nsff.prepare.steps.sheet import NO_FLOW, flow_cell
+from hdr_nsff.prepare.steps.sheet import NO_FLOW, flow_cell, places_shown
 from hdr_nsff.priors.flow.dense import average_with_reverse
 from hdr_nsff.priors.flow.local_motion import LOCAL_MOTION_TUNING
 from hdr_nsff.scene.manifest import Manifest
@@ -493,6 +493,17 @@ def test_masks_that_mark_nothing_are_taken(config):
     for path in sorted(config.masks.glob("*.png")):
         write_png(path, np.zeros((H, W)))
     assert not any(f.moving.any() for f in Scene.open(prepare(config)).train)
+
+
+@pytest.mark.parametrize("count", [3, 6, 10, 11, 31, 36])
+@pytest.mark.parametrize("cycle", [1, 2, 3])
+def test_the_sheet_shows_all_exposures_over_the_whole_clip(count, cycle):
+    brackets = [t % cycle for t in range(count)]
+    places = places_shown(brackets)
+    shown = [brackets[k] for k in places]
+    assert len(places) == min(count, 6) and places[0] == 0 and places[-1] >= count - cycle
+    assert {shown.count(b) for b in range(cycle)} == {len(shown) // cycle} or count < 6
+    assert max(np.diff(places)) <= count / 5 + 2 * cycle
 
 
 def test_a_frame_without_flow_is_gray_in_the_sheet(config):

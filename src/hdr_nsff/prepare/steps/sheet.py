@@ -28,8 +28,7 @@ def draw_sheet(work: Work) -> StepResult:
     """
     m = work.manifest
     assert m.movers is not None
-    chosen = np.unique(np.linspace(0, len(work.train) - 1, NUM_COLUMNS).astype(int))
-    frames = [work.train[k] for k in chosen]
+    frames = [work.train[k] for k in places_shown([f.bracket for f in work.train])]
     movers = read_movers(work.folder / m.movers)
     rows = {
         "recorded": [work.video[f.index] for f in frames],
@@ -48,6 +47,21 @@ def draw_sheet(work: Work) -> StepResult:
         note=", ".join(rows),
         files={SHEET: lambda path: write_png(path, contact_sheet(cells))},
     )
+
+
+def places_shown(brackets: Sequence[int]) -> list[int]:
+    """The places of up to NUM_COLUMNS frames among those of these `brackets`, about
+    evenly spread. Exposures take turns: even steps may meet one of a cycle only.
+    """
+    count = len(brackets)
+    if count <= NUM_COLUMNS:
+        return list(range(count))
+    kinds = np.unique(brackets)
+    chosen = set()
+    for column, even in enumerate(np.linspace(0, count - 1, NUM_COLUMNS)):
+        alike = np.flatnonzero(np.array(brackets) == kinds[column % len(kinds)])
+        chosen.add(int(alike[np.abs(alike - even).argmin()]))
+    return sorted(chosen)
 
 
 def moving_cell(work: Work, f: FrameEntry) -> np.ndarray:
