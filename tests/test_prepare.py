@@ -20,6 +20,7 @@ from hdr_nsff.core.images import read_image, read_mask, write_png
 from hdr_nsff.core.io import write_npy
 from hdr_nsff.geometry.round_trip import round_trip
 from hdr_nsff.prepare.prepare import STEPS, PrepareConfig, prepare
+from hdr_nsff.prepare.steps.masks import moving_share
 from hdr_nsff.prepare.steps.sheet import NO_FLOW, flow_cell, places_shown
 from hdr_nsff.priors.flow.dense import average_with_reverse
 from hdr_nsff.priors.flow.local_motion import LOCAL_MOTION_TUNING
@@ -403,6 +404,13 @@ def test_a_clip_from_a_tripod_is_prepared_without_other_input(tmp_path):
         assert float((f.disparity[f.moving] - 1 / 0.85).abs().max()) < 1e-3
     middle = scene.train[4].moving
     assert middle[26:42, 30:46].float().mean() > 0.8 and middle.float().mean() < 0.25
+
+
+def test_a_tripod_that_moves_is_doubted():
+    moving = np.ones((3, 4, 4), bool)
+    assert "leave out --tripod" in moving_share(moving, tripod=True)
+    assert "--tripod" not in moving_share(moving, tripod=False)
+    assert "--tripod" not in moving_share(~moving, tripod=True)
 
 
 def test_steps_depend_only_on_steps_before_them():

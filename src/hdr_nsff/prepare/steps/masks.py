@@ -15,7 +15,7 @@ from hdr_nsff.prepare.still_cameras import still_cameras
 from hdr_nsff.prepare.tracks import share_masks
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.priors.masks.background import correct_by_background
-from hdr_nsff.priors.masks.geometric import geometric_mask
+from hdr_nsff.priors.masks.geometric import GeometricMaskTuning, geometric_mask
 from hdr_nsff.priors.masks.unsteady import mark_unsteady
 
 
@@ -35,10 +35,20 @@ def find_masks(work: Work) -> StepResult:
             moving = sam2_masks(work, moving)
     return StepResult(
         provenance="given" if given else "estimated",
-        note=f"{moving.mean():.1%} of the pixels move",
+        note=moving_share(moving, c.tripod),
         details={"source": "given" if given else c.masks or "motion"},
         maps={"mask": {f.index: mask for f, mask in zip(m.frames, moving, strict=True)}},
     )
+
+
+def moving_share(moving: np.ndarray, tripod: bool) -> str:
+    """How much of the frames is marked in `moving` (T, H, W), and whether that goes
+    with a camera that is said to stand on a `tripod`.
+    """
+    note = f"{moving.mean():.1%} of the pixels move"
+    if tripod and moving.mean() > GeometricMaskTuning().doubtful_share:
+        note += ", as if the camera did: leave out --tripod if it does not stand still"
+    return note
 
 
 def estimated_masks(work: Work) -> np.ndarray:
