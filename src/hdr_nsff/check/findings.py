@@ -123,7 +123,7 @@ def judge_exposure(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]
         text = f"two exposures are {widest:.1f} EV apart and share few mid-tones"
         yield Finding("warning", "exposure", text, "use steps of 1 to 3 EV, or a third exposure")
     if exposure.empty:
-        advice = "leave them out (--start, --end) if they are no exposure of the cycle"
+        advice = "leave them out (--start, --end), or give `prepare` the exposures: --ev"
         yield Finding("warning", "exposure", exposure.empty, advice)
     jumping = exposure.cycle == 1 and exposure.change_ev > MIN_STEP  # said above
     if exposure.drift_ev > tuning.max_drift_ev and exposure.given is None and not jumping:

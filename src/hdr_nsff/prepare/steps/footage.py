@@ -74,9 +74,7 @@ def frames_step(work: Work) -> StepResult:
     check_frames(c.clip, entries, extents)
     empty = empty_frames(extents)
     if empty:
-        say(
-            f"frames: {empty}; leave them out (--start, --end) if they are no exposure of the cycle"
-        )
+        say(f"frames: {empty}; leave them out (--start, --end) or give --ev")
     if work.footage.video:
         check_lengths(c.clip, entries)
     m.frame_seconds = frame_seconds(work, entries, seconds)
@@ -169,7 +167,8 @@ def empty_frames(extents: list[tuple[float, float]]) -> str:
             found.append(f"{format_ranges(numbers)} {color} all over")
     if not found:
         return ""
-    return f"of {len(extents)} frames, counted from 0, {' and '.join(found)}, which hides a cycle"
+    listed = " and ".join(found)
+    return f"of {len(extents)} frames, counted from 0, {listed}, which can hide a cycle"
 
 
 def check_lengths(clip: Path, entries: list[FrameEntry]) -> None:
