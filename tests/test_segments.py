@@ -210,6 +210,17 @@ def test_a_clip_that_cannot_be_cut_is_refused_before_flow(config, tmp_path):
     assert not (tmp_path / "rig").exists()
 
 
+def test_what_was_found_before_a_refusal_becomes_the_scene_without_segments(config, tmp_path):
+    short = replace(config, out=tmp_path / "out", segment=0.1)
+    with pytest.raises(InputError, match="2 frames"):
+        prepare(short)
+    found = Manifest.load(short.out / "clip").steps
+    prepare(replace(short, segment=None))
+    scene = Manifest.load(short.out)
+    assert {name: scene.steps[name] for name in found} == found and scene.steps["sheet"].done
+    assert not (short.out / "clip").exists()
+
+
 def test_segments_do_not_go_into_a_folder_with_something_else(config, tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     for out, sentence in (

@@ -41,7 +41,12 @@ from hdr_nsff.prepare.cut_parts import (
 )
 from hdr_nsff.prepare.engine import found_manifest
 from hdr_nsff.prepare.lens import check_lens_in_turn, given_lenses, known_lenses
-from hdr_nsff.prepare.segments import CLIP_FOLDER, check_segments, prepare_segments
+from hdr_nsff.prepare.segments import (
+    CLIP_FOLDER,
+    bring_back_clip,
+    check_segments,
+    prepare_segments,
+)
 from hdr_nsff.prepare.steps.footage import MIN_FRAMES, ClipCutsError, check_count
 from hdr_nsff.prepare.steps.neural import check_networks
 from hdr_nsff.prepare.table import STEPS, run_steps
@@ -72,6 +77,7 @@ def prepare_scenes(config: PrepareConfig, part_cuts: bool = True) -> list[Path]:
         if config.segment is not None:
             check_segments(config)
             return prepare_segments(begin(replace(config, out=config.out / CLIP_FOLDER)))
+        bring_back_clip(config.out)
         parts = known_parts(config) if part_cuts else None
         if parts is not None:
             return prepare_parts(config, parts)

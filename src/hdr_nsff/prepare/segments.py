@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import is_leftover, read_npy, write_npy
+from hdr_nsff.core.io import SCENE_FILE, is_leftover, read_npy, write_npy
 from hdr_nsff.core.progress import say
 from hdr_nsff.prepare.engine import Step, found_manifest
 from hdr_nsff.prepare.result import StepResult
@@ -77,14 +77,29 @@ def check_place(out: Path) -> None:
         return
     if not out.is_dir():
         raise InputError(f"{out}: is a file; choose a folder to write the scenes to")
-    if (out / "scene.json").exists():
+    if (out / SCENE_FILE).exists():
         raise InputError(
             f"{out}: holds the scene of a whole clip; choose another folder for segments"
         )
-    begun = (out / CLIP_FOLDER / "scene.json").exists()
+    begun = (out / CLIP_FOLDER / SCENE_FILE).exists()
     others = [path for path in out.iterdir() if path.name != CLIP_FOLDER and not is_leftover(path)]
     if others and not begun:
         raise InputError(f"{out}: holds other files and no scene; choose an empty or new folder")
+
+
+def bring_back_clip(out: Path) -> None:
+    """Make what was found of a clip that could not be cut the scene in `out`, for a
+    command without `--segment`.
+    """
+    clip = out / CLIP_FOLDER
+    if not (clip / SCENE_FILE).is_file() or (out / SCENE_FILE).exists():
+        return
+    if any(path != clip and not is_leftover(path) for path in out.iterdir()):
+        return
+    (clip / SCENE_FILE).rename(out / SCENE_FILE)  # first: then a kill loses steps at most
+    for path in clip.iterdir():
+        path.rename(out / path.name)
+    clip.rmdir()
 
 
 def prepare_segments(clip: Work) -> list[Path]:
