@@ -46,7 +46,7 @@ def test_training_can_be_watched(
     assert subprocess.Popen is FakeProcess
     assert call(*training(toy_folder, tmp_path / "run", 1), "--view") == 0
     (command,) = FakeProcess.commands
-    assert command[3:] == ["view", str(tmp_path / "run"), "--wait", "--device", "cpu"]
+    assert command[4:] == ["view", str(tmp_path / "run"), "--wait", "--device", "cpu"]
     assert FakeProcess.ended == 1
     assert "opens it again" in capsys.readouterr().err
 

@@ -6,6 +6,7 @@ The last two are for other programs. The writers of layouts are in `footage/layo
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -172,7 +173,7 @@ def check_output(config: ExportConfig) -> None:
     if config.ply_sequence and out.is_file():
         advice = "--ply-sequence writes a folder, name another one"
         raise InputError(f"{out}: is a file; {advice}")
-    if config.ply_sequence and not out.resolve().name:  # whose note would be beside it
+    if config.ply_sequence and not Path(os.path.abspath(out)).name:  # its note would be beside it
         raise InputError(f"{out}: --ply-sequence writes a folder of its own; name one below this")
 
 
