@@ -170,7 +170,7 @@ def test_more_processes_than_batches_is_said(
     toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        distributed, "group", lambda: contextlib.nullcontext(distributed.Ranks(0, 4))
+        distributed, "group", lambda device: contextlib.nullcontext(distributed.Ranks(0, 4))
     )
     with pytest.raises(InputError, match="4 processes share 2 batches"):
         train(config(toy_folder, tmp_path / "run"))

@@ -181,7 +181,7 @@ class HexPlane(nn.Module):
         """Density (M,) per cube side at `coords` (M, 3) and a share of the clip."""
         features = self.density_planes(coords, share)
         with layers_in_bf16(coords, self.bf16 and self.training):
-            raw = self.to_density(features)[:, 0].float()
+            raw = self.to_density(features)[:, 0].to(coords.dtype)
         return DENSITY_SCALE * nn.functional.softplus(raw - self.config.emptiness)
 
     def radiance(self, coords: Tensor, directions: Tensor, share: float) -> Tensor:
@@ -191,9 +191,10 @@ class HexPlane(nn.Module):
         """
         features = self.appearance_planes(coords, share)
         with layers_in_bf16(coords, self.bf16 and self.training):
-            features = self.to_features(features).float()
+            features = self.to_features(features).to(coords.dtype)
             inputs = [frequencies(features, OCTAVES), frequencies(directions, OCTAVES)]
-            log_radiance = self.color(torch.cat(inputs, -1)).float() + self.bias
+            raw = self.color(torch.cat(inputs, -1)).to(coords.dtype)
+        log_radiance = raw + self.bias
         return log_radiance.clamp(max=MAX_LOG_RADIANCE).exp()
 
     def forward(self, batch: PixelBatch) -> tuple[Render, dict[str, Tensor]]:

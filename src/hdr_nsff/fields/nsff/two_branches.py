@@ -212,7 +212,7 @@ class TwoBranches(nn.Module):
         directions = self.view_directions(samples, index)
         with layers_in_bf16(coords, self.bf16 and self.training):
             raw = self.branches.static(coords, directions)
-        return self.scatter(raw.float(), index, keep.shape, self.density_bias(static=True))
+        return self.scatter(raw.to(coords.dtype), index, keep.shape, self.density_bias(static=True))
 
     def query_dynamic(
         self,
@@ -229,8 +229,8 @@ class TwoBranches(nn.Module):
         """
         with layers_in_bf16(coords, self.bf16 and self.training):
             raw, raw_motion = self.branches.dynamic(coords, knot, directions, motion)
-        content = self.scatter(raw.float(), index, shape, self.density_bias(static=False))
-        return content, None if raw_motion is None else raw_motion.float()
+        content = self.scatter(raw.to(coords.dtype), index, shape, self.density_bias(static=False))
+        return content, None if raw_motion is None else raw_motion.to(coords.dtype)
 
     def scatter(self, raw: Tensor, index: Tensor, shape: torch.Size, bias: float) -> BranchOutput:
         """Raw numbers (M, 4 or 5) of samples `index`, as rays of `shape` (N, S)."""
