@@ -14,7 +14,6 @@ from presets import small, trainer
 from torch import Tensor
 from toy_scene import CARD, card_offset
 
-from hdr_nsff.fields.base import RadianceField
 from hdr_nsff.fields.build import initialize_field
 from hdr_nsff.fields.outputs import select_pixels
 from hdr_nsff.fields.splat.config import SplatConfig
@@ -119,14 +118,6 @@ def test_at_the_ends_of_the_clip_scene_flow_continues_straight(time: float) -> N
     torch.testing.assert_close(render.scene_flow[-1][at], -STEP, atol=1e-3, rtol=0)
 
 
-@pytest.mark.parametrize("time", [0.0, 0.3, 1.0])
-def test_two_training_times_have_the_scene_flow_from_one_to_the_other(time: float) -> None:
-    render = card_field(times=2).render(CAMERA, time)
-    at = pixel_of(torch.tensor([0.0, 0, 2]) + time * STEP)
-    torch.testing.assert_close(render.scene_flow[1][at], STEP, atol=1e-3, rtol=0)
-    torch.testing.assert_close(render.scene_flow[-1][at], -STEP, atol=1e-3, rtol=0)
-
-
 @pytest.mark.parametrize("offset", [1, -1])
 def test_flow_to_the_neighbor_is_the_projected_displacement(offset: int) -> None:
     render, _ = card_field()(batch_of(4, offset))
@@ -165,26 +156,6 @@ def test_flow_to_one_side_and_rigidity_take_turns_by_the_seed() -> None:
     assert [[w.offset for w in render.warps] for render, _ in passes] == [[1], [], [-1], [], [1]]
     assert ["rigidity" in own for _, own in passes] == [False, True, False, True, False]
     assert card_field()(replace(both, flow={}))[0].warps == ()
-
-
-def test_fractional_times_lie_between() -> None:
-    field = card_field()
-    for time in (3.25, 3.5, 3.75):
-        at = field.positions(time).detach()
-        low, high = (field.positions(k).detach() for k in (3.0, 4.0))
-        torch.testing.assert_close(at, torch.lerp(low, high, time - 3))
-    columns = torch.arange(1200) % 40
-    motions = [field.render(CAMERA, t).motion for t in (3.0, 3.5, 4.0)]
-    middles = [float((m * columns).sum() / m.sum()) for m in motions]
-    assert middles[0] < middles[1] < middles[2]
-    assert middles[1] == pytest.approx((middles[0] + middles[2]) / 2, abs=0.05)
-
-
-def test_times_may_be_uneven() -> None:
-    field = card_field()
-    field.times[:] = torch.tensor([0.0, 1, 2, 3, 7, 8, 9, 10, 11, 12])
-    expected = torch.lerp(field.positions(3.0), field.positions(4.0), 0.5)
-    torch.testing.assert_close(field.positions(field.knot(5.0)), expected)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -356,18 +327,6 @@ def test_the_cloud_is_what_render_draws() -> None:
     assert len(cloud.means) == 33 * 25 - 25 + 121 and cloud.motion.sum() == 121
     torch.testing.assert_close(cloud.means[-121:].mean(0), torch.tensor([0.0, 0, 2]) + 4.5 * STEP)
     torch.testing.assert_close(cloud.radiance[-1], torch.tensor([1.0, 0, -1]).exp())
-
-
-def test_one_training_time_has_no_flow() -> None:
-    field = Splat(SplatConfig(static=20, moving=20, bases=1), torch.zeros(1), 1.0, 6.0, 1200)
-    for g in (field.static, field.moving):
-        g.means.data[:, 2], g.opacity_logits.data[:], g.log_scales.data[:] = 2.0, 0.0, -2.0
-    assert isinstance(field, RadianceField)
-    render = field.render(CAMERA, 0.7)
-    assert float(render.scene_flow[1].abs().max()) == float(render.scene_flow[-1].abs().max()) == 0
-    assert float(render.motion.max()) > 0.1
-    _, own = field(replace(batch_of(0, 1), flow={}))
-    assert torch.isfinite(own["trajectory"])
 
 
 def test_colors_change_over_the_clip_and_static_ones_in_brightness_only() -> None:
