@@ -18,7 +18,8 @@ from typing import Any, TypeVar
 
 from hdr_nsff.core.errors import InputError, check_number, shorten
 from hdr_nsff.footage.footage import Footage
-from hdr_nsff.scene.manifest import MAX_EV, MAX_SECONDS
+from hdr_nsff.geometry.paths import MAX_EV
+from hdr_nsff.scene.manifest import MAX_SECONDS
 
 LIST = "exposures.csv"  # in a folder of frames
 # columns of a CSV: times, and the seconds of their unit

@@ -18,6 +18,7 @@ from hdr_nsff.core.io import read_json, write_json
 from hdr_nsff.core.names import resolve_name
 from hdr_nsff.core.notes import first_problem
 from hdr_nsff.geometry.lens import Lens
+from hdr_nsff.geometry.paths import MAX_EV
 
 Parallax = Literal["full", "rotation", "none"]
 Provenance = Literal["estimated", "given", "absent"]
@@ -27,7 +28,6 @@ Protocol = Literal["novel-view", "novel-view-time"]
 # Numbers beyond it, and depths below 1 / it, are no measurements and would overflow in
 # single precision.
 MAX_NUMBER = 1e15
-MAX_EV = 60.0  # stops from the reference
 MAX_SECONDS = 1e6  # of an exposure
 
 

@@ -26,16 +26,9 @@ from hdr_nsff.core.exr import MOTION_DIRECTIONS, read_exr
 from hdr_nsff.core.images import read_image
 from hdr_nsff.core.io import read_json
 from hdr_nsff.core.notes import first_problem
+from hdr_nsff.geometry.paths import MAX_EV
 from hdr_nsff.radiometry.recording import Curve, vignette
-from hdr_nsff.scene.manifest import (
-    MAX_EV,
-    FrameEntry,
-    Strict,
-    inside,
-    is_intrinsic,
-    is_matrix,
-    is_pose,
-)
+from hdr_nsff.scene.manifest import FrameEntry, Strict, inside, is_intrinsic, is_matrix, is_pose
 
 RESPONSE_MARGIN = 1e-3  # of a recorded value: rounding may take it this far out of [0, 1]
 MAX_GAIN = 1e6  # of a white balance, so that products stay finite

@@ -13,10 +13,10 @@ from tyro.conf import Positional
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.hdr_video import Codec
 from hdr_nsff.geometry.lens import Lens
+from hdr_nsff.geometry.paths import MAX_EV
 from hdr_nsff.maths.hdr_signal import Transfer
 from hdr_nsff.radiometry.hdr_stills import HdrStill
 from hdr_nsff.radiometry.recording import Noise, response_curve
-from hdr_nsff.scene.manifest import MAX_EV
 from hdr_nsff.synth.scenes.base import Views
 from hdr_nsff.synth.scenes.geometry import intrinsics
 

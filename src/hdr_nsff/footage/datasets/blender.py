@@ -29,7 +29,7 @@ from hdr_nsff.footage.datasets.set_files import (
     source_of,
 )
 from hdr_nsff.footage.pose_formats import from_transforms
-from hdr_nsff.scene.manifest import MAX_EV
+from hdr_nsff.geometry.paths import MAX_EV
 
 TRAIN = "transforms_train.json"
 TEST = "transforms_test.json"
