@@ -23,6 +23,7 @@ from toy_scene import ToyScene
 
 from hdr_nsff import __version__
 from hdr_nsff.bench import bench
+from hdr_nsff.core.exr import read_exr, write_exr
 from hdr_nsff.scene.movers import write_movers
 from hdr_nsff.training.run_folder import Run, last_logged, snapshots
 from hdr_nsff.training.train import Trainer
@@ -172,6 +173,19 @@ def test_a_run_that_was_evaluated_otherwise_is_measured_again(scenes: Path, tmp_
     assert call(*command, "--collect") == 1
     assert call(*command) == 0
     assert rows(out)["toy/a"]["psnr"] == before
+
+
+def test_a_run_is_measured_again_when_pictures_of_the_truth_change(tmp_path: Path) -> None:
+    ToyScene(32, 24).write(tmp_path / "toy")
+    truth_of(tmp_path / "truth")
+    command = bench_words(tmp_path / "out", tmp_path / "toy", f"a=tiny {SMALL}", "--views", 0)
+    assert call(*command) == 0
+    before = rows(tmp_path / "out")["toy/a"]["psnr"]
+    picture = sorted((tmp_path / "truth").rglob("*.exr"))[0]
+    write_exr(picture, {"RGB": read_exr(picture)["RGB"][::-1]})
+    assert call(*command, "--collect") == 1
+    assert call(*command) == 0
+    assert rows(tmp_path / "out")["toy/a"]["psnr"] != before
 
 
 def test_lines_of_the_list_do_one_run_each(scenes: Path, tmp_path: Path, capsys: Capture) -> None:

@@ -80,10 +80,9 @@ def read_record(run: BenchRun) -> RunRecord:
 def measure_key(run: BenchRun, views: int, lpips: str | None) -> str:
     """A hash of the truth that a run is measured on, and of the settings."""
     truth = run.scene.truth
-    digest = None
-    if truth is not None:
-        digest = hashlib.sha256((truth / "truth.json").read_bytes()).hexdigest()
-    return hashlib.sha256(json.dumps([digest, lpips, views]).encode()).hexdigest()[:16]
+    paths = [] if truth is None else sorted(path for path in truth.rglob("*") if path.is_file())
+    files = [(path.relative_to(truth).as_posix(), hash_file(path)) for path in paths]
+    return hashlib.sha256(json.dumps([files, lpips, views]).encode()).hexdigest()[:16]
 
 
 def is_complete(run: BenchRun, views: int, lpips: str | None) -> bool:
