@@ -27,7 +27,7 @@ from hdr_nsff.fields.outputs import record_pixels
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.base import ToneMapConfig
 from hdr_nsff.training import run_folder
-from hdr_nsff.training.budget import Budget, Clock, Schedule, minutes_for
+from hdr_nsff.training.budget import Budget, Clock, Schedule, Stopwatch, minutes_for
 from hdr_nsff.training.config import TrainConfig
 from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.run_folder import Run, read_log, snapshots
@@ -361,6 +361,12 @@ def test_without_steps_the_clock_counts_minutes() -> None:
     clock = Clock(Budget(minutes=5.0), Schedule(period=0.5), 24, 10**6, 75.0)
     assert clock.progress == 0.25 and clock.phase == 0.5
     assert replace(clock, seconds=1e6).progress == 1.0
+
+
+def test_the_first_step_says_nothing_of_the_time_left() -> None:
+    clock = Clock(Budget(steps=100), Schedule(), 24, step=1, seconds=Stopwatch(0.0).read())
+    assert clock.seconds_left is None
+    assert replace(clock, step=50, seconds=20.0).seconds_left == pytest.approx(20.0)
 
 
 @pytest.mark.parametrize("kind", ["none", "fixed", "per_image", "mlp", "sigmoid"])

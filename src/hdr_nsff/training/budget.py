@@ -96,7 +96,7 @@ class Clock:
     @property
     def seconds_left(self) -> float | None:
         """Seconds of training that are left at the speed so far; None at the start."""
-        return seconds_left(self.progress, 1.0, self.seconds)
+        return seconds_left(self.progress, 1.0, self.seconds) if self.seconds else None
 
     @property
     def phase(self) -> float:
@@ -124,6 +124,7 @@ class Stopwatch:
         """Seconds of training so far; the first reading starts the watch."""
         if self.started is None:
             self.started = time.monotonic()
+            return self.before
         return self.before + time.monotonic() - self.started
 
     @contextmanager
