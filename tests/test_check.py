@@ -123,14 +123,6 @@ def test_bands_of_mains_flicker_are_found(tmp_path: Path) -> None:
     assert any(finding.subject == "flicker" for finding in judge(facts))
 
 
-def test_a_cut_is_found(tmp_path: Path) -> None:
-    def cut(t: int) -> np.ndarray:
-        return still_scene(t) if t < 5 else still_scene(t)[:, ::-1]
-
-    facts, _, _ = measured(clip_of(tmp_path, cut, [0.0] * FRAMES))
-    assert facts.camera.cuts == (5,)
-
-
 def test_a_blurred_long_exposure_is_found(tmp_path: Path) -> None:
     def blurred(t: int) -> np.ndarray:
         picture = still_scene(t)
@@ -244,6 +236,7 @@ def good_facts() -> ClipFacts:
     return ClipFacts(
         FileFacts("a.mp4", 60, 1, 640, 360, 24.0, 8, "recorded", (41.7, 41.7)),
         60,
+        (0, 60),
         ExposureFacts(2, (0.0, 2.0), 0.97, None, 2.0, 0.1, (0.0, 0.2), (0.1, 0.0), 0.0),
         CameraFacts("parallax", 0.2, 3.0, 0.98, ()),
     )
@@ -285,6 +278,7 @@ def test_every_warning_comes_with_advice() -> None:
     bad = ClipFacts(
         replace(good.file, frames=5, interval_ms=(20.0, 60.0)),
         5,
+        (0, 3),
         replace(exposure, black_share=(0.5, 0.1)),
         CameraFacts("tripod", 0.9, 40.0, 0.5, (3,)),
     )

@@ -79,9 +79,10 @@ def read_record(run: BenchRun) -> RunRecord:
 
 def measure_key(run: BenchRun, views: int, lpips: str | None) -> str:
     """A hash of the truth that a run is measured on, and of the settings."""
-    truth = run.scene.truth
-    paths = [] if truth is None else sorted(path for path in truth.rglob("*") if path.is_file())
-    files = [(path.relative_to(truth).as_posix(), hash_file(path)) for path in paths]
+    files: list[tuple[str, str]] = []  # of the truth: names and contents
+    if (truth := run.scene.truth) is not None:
+        paths = sorted(path for path in truth.rglob("*") if path.is_file())
+        files = [(path.relative_to(truth).as_posix(), hash_file(path)) for path in paths]
     return hashlib.sha256(json.dumps([files, lpips, views]).encode()).hexdigest()[:16]
 
 

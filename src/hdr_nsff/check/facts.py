@@ -82,7 +82,7 @@ class CameraFacts:
     pixels_per_frame: float  # median motion of matched points, pixels of the clip
     # edges of the brightest bracket relative to those of the darkest: below 1 blurred
     long_sharpness: float | None
-    cuts: tuple[int, ...]  # frames that show something else than the one before
+    cuts: tuple[int, ...] = ()  # frames that show something else than the one before
     lens: LensFacts | None = None  # None: unknown
     # of a rolling shutter, as a share of the time between frames, and its standard
     # error; None: unknown
@@ -95,6 +95,7 @@ class ClipFacts:
 
     file: FileFacts
     looked_at: int  # frames, from the start on
+    measured: tuple[int, int]  # the first of these that are measured, and the end
     exposure: ExposureFacts
     camera: CameraFacts
     each_camera: tuple[CameraExposure, ...] = ()  # where there are several

@@ -112,7 +112,8 @@ def judge_exposure(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]
         )
         yield Finding("good", "exposure", text)
     elif exposure.change_ev > MIN_STEP:
-        text = without_cycle(exposure.change_ev, facts.looked_at)
+        first, end = facts.measured
+        text = without_cycle(exposure.change_ev, end - first)
         yield Finding("warning", "exposure", text, "list the exposures in exposures.csv")
     else:
         text = "the exposure does not alternate, so light beyond its white is not recorded"
@@ -266,7 +267,9 @@ def judge_camera(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
         yield Finding("warning", "camera", text, "move slower, or record more frames a second")
     if camera.cuts:
         listed = ", ".join(str(cut) for cut in camera.cuts[:6])
-        text = f"the clip is cut at frame {listed}"
+        first, end = facts.measured
+        text = f"the first {facts.looked_at} frames are cut at frame {listed}"
+        text += f"; exposures and camera are those of frames {first} to {end - 1}"
         advice = "`prepare` makes a scene of each part; for one of them, --start A --end B"
         yield Finding("problem", "cuts", text, advice)
 
@@ -338,7 +341,7 @@ def judge_file(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
     if offer is not None:
         advice = f"{offer.advice('hdr-nsff run')}, or choose a part with --start and --end"
         yield Finding("note", "length", offer.sentence(file.frames), advice)
-    elif file.frames > tuning.many_frames:
+    elif file.frames > tuning.many_frames and not facts.camera.cuts:
         text = f"{file.frames} frames take long, and most of that time repeats itself"
         yield Finding("note", "length", text, "choose a part with --start and --end")
     if facts.exposure.missing_before:

@@ -4,7 +4,8 @@ the cycle by brightness, SIFT matches on equalized frames, rotations that explai
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -66,6 +67,7 @@ def measure_clip(
     """The facts of a clip, its small frames (T, H, W, 3), and their brackets (T,).
 
     Of several cameras or tracks, the first is looked at, and the exposures of all.
+    Where the picture cuts, the longest part between two cuts is measured.
     InputError for footage that cannot be read, and where all is black or white.
     """
     clip, footage = footage.path, with_bars(footage)
@@ -86,20 +88,31 @@ def measure_clip(
         raise InputError(f"{clip}: all frames are {nothing}; check that it plays")
     file = describe_file(footage)
     given = given_exposures(footage, len(video))[0]
-    if given is not None:
-        cycle, gaps = given.cycle()
-    else:
-        gapped = find_cycle(exposure.brightness_steps(video), np.ones(len(video) - 1, int))
-        cycle, gaps = gapped.cycle, gapped.gaps
+    empty, looked_at = empty_frames([exposure.extent(picture) for picture in video]), len(video)
+    cycle, gaps = cycle_of(given, video)
+    cuts = find_cuts(exposure.equalize(video, cycle.brackets)[0])
+    first, end = max(pairwise([0, *cuts, looked_at]), key=lambda part: part[1] - part[0])
+    if cuts:
+        video = video[first:end]
+        given = None if given is None else replace(given, ev=given.ev[first:end])
+        cycle, gaps = cycle_of(given, video)
     equalized, clipped = exposure.equalize(video, cycle.brackets)
     keypoints = detect_keypoints(equalized, clipped)
     following = match_pairs(keypoints, [(t, t + 1) for t in range(len(video) - 1)])
     scale = max(file.width, file.height) / max(video.shape[1:3])
     facts = ClipFacts(
         file=file,
-        looked_at=len(video),
-        exposure=measure_exposure(given, video, cycle, keypoints, gaps, tuning),
-        camera=measure_camera(equalized, clipped, cycle, keypoints, following, scale, tuning),
+        looked_at=looked_at,
+        measured=(first, end),
+        exposure=replace(
+            measure_exposure(given, video, cycle, keypoints, tuning),
+            missing_before=tuple(first + gap for gap in gaps),
+            empty=empty,
+        ),
+        camera=replace(
+            measure_camera(equalized, clipped, cycle, keypoints, following, scale, tuning),
+            cuts=tuple(cuts),
+        ),
         each_camera=measure_cameras(footage, tuning.max_size, tuning.low, tuning.high),
     )
     return facts, video, cycle.brackets
@@ -108,12 +121,23 @@ def measure_clip(
 # Exposure
 
 
+def cycle_of(
+    given: GivenExposures | None, video: np.ndarray
+) -> tuple[exposure.Cycle, tuple[int, ...]]:
+    """The cycle of `given` exposures, else of brightness, and the frames before which
+    it skips some.
+    """
+    if given is not None:
+        return given.cycle()
+    gapped = find_cycle(exposure.brightness_steps(video), np.ones(len(video) - 1, int))
+    return gapped.cycle, gapped.gaps
+
+
 def measure_exposure(
     given: GivenExposures | None,
     video: np.ndarray,
     cycle: exposure.Cycle,
     keypoints: list[Keypoints],
-    gaps: tuple[int, ...],
     tuning: CheckTuning,
 ) -> ExposureFacts:
     """Exposures of the recorded `video` (T, H, W, 3), and what they clip."""
@@ -139,14 +163,12 @@ def measure_exposure(
         given=None if given is None else given.source,
         given_drift_ev=0.0 if given is None else round(given.drift(), 2),
         contradictions=tuple(contradictions),
-        empty=empty_frames([exposure.extent(picture) for picture in video]),
         change_ev=round(float(np.abs(steps).mean()), 3),
         drift_ev=round(drift.exposure_ev, 2),
         color_drift_ev=round(drift.color_ev, 2),
         white_share=per_bracket(white),
         black_share=per_bracket(black),
         banding_ev=round(measure_banding(video, keypoints, cycle.length, tuning), 3),
-        missing_before=gaps,
     )
 
 
@@ -200,7 +222,6 @@ def measure_camera(
 
     `scale` is the pixels of the clip per pixel of these.
     """
-    cuts = find_cuts(equalized)
     motion, share = find_motion(equalized, clipped, keypoints)
     shifts = [np.linalg.norm(pair.q - pair.p, axis=1) for pair in following if len(pair.p)]
     per_frame = float(np.median(np.concatenate(shifts))) if shifts else 0.0
@@ -208,18 +229,17 @@ def measure_camera(
     # with so little parallax `prepare` looks for no lens either: mapping would take
     # minutes and fail
     enough = share is None or share < PosesTuning().no_lens_share
-    if motion == "parallax" and enough and not cuts:
+    if motion == "parallax" and enough:
         lens = measure_lens(equalized, clipped, scale)
     height, width = equalized.shape[1:3]
     readout = None
-    if motion != "tripod" and not cuts:
+    if motion != "tripod":
         readout = measure_readout(following, (height, width), portrait=height > width)
     return CameraFacts(
         motion=motion,
         rotation_share=None if share is None else round(share, 3),
         pixels_per_frame=round(scale * per_frame, 2),
         long_sharpness=compare_sharpness(equalized, clipped, cycle, tuning),
-        cuts=tuple(cuts),
         lens=lens,
         readout=None if readout is None else (round(readout[0], 3), round(readout[1], 3)),
     )

@@ -39,7 +39,8 @@ def draw(
     FigureCanvasAgg(figure)
     height = 5.0 + text_height
     file = facts.file
-    title = f"{file.name}: {file.width} x {file.height}, the first {facts.looked_at} frames"
+    first, end = facts.measured
+    title = f"{file.name}: {file.width} x {file.height}, frames {first} to {end - 1}"
     figure.text(0.02, 1 - 0.3 / height, title, fontsize=13, weight="bold")
     note = "red: saturated, blue: black"
     figure.text(0.98, 1 - 0.3 / height, note, fontsize=9, ha="right", color="#444444")
@@ -48,15 +49,15 @@ def draw(
         axes = figure.add_axes((*place, 0.94 / len(shown), 2.3 / height))
         axes.imshow(mark_clipped(video[t]))
         axes.set_axis_off()
-        axes.set_title(f"frame {t}, exposure {brackets[t]}", fontsize=9)
+        axes.set_title(f"frame {first + t}, exposure {brackets[t]}", fontsize=9)
     axes = figure.add_axes((0.06, (text_height + 0.35) / height, 0.92, 1.25 / height))
     brightness = np.median(video.mean(-1).reshape(len(video), -1), 1)
-    axes.plot(brightness, color="#bbbbbb", linewidth=0.8)
-    axes.scatter(range(len(video)), brightness, c=list(brackets), cmap="viridis", s=14, zorder=2)
+    axes.plot(range(first, end), brightness, color="#bbbbbb", linewidth=0.8)
+    axes.scatter(range(first, end), brightness, c=list(brackets), cmap="viridis", s=14, zorder=2)
     axes.set_ylabel("median", fontsize=8)
     axes.set_xlabel("frame; colors: exposures", fontsize=8)
     axes.tick_params(labelsize=8)
-    axes.set_xlim(-1, len(video))
+    axes.set_xlim(first - 1, end)
     for i, (text, color, weight) in enumerate(lines):
         y = (text_height - 0.35 - 0.19 * i) / height
         figure.text(0.02, y, text, fontsize=9.5, color=color, weight=weight, family="monospace")
