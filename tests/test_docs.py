@@ -20,6 +20,7 @@ from hdr_nsff.core.settings import to_plain
 from hdr_nsff.scene.manifest import FrameEntry, LensEntry, Manifest, StepRecord
 from hdr_nsff.scene.movers import Mover
 from hdr_nsff.scene.response import ResponseFile
+from hdr_nsff.scene.truth import Truth, TruthView
 from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.weighted_terms import merge_weights
 
@@ -149,11 +150,20 @@ def test_the_table_of_the_method_has_the_weights_of_a_preset(preset: str, column
         ("movers.npz", (Mover,)),
     ],
 )
-def test_the_formats_have_a_row_for_every_key_of_a_scene(file: str, models: tuple) -> None:
+def test_the_formats_have_the_keys_of_a_scene_and_no_others(file: str, models: tuple) -> None:
     section = text_of(ROOT / "docs" / "formats.md").partition(f"### `{file}`\n")[2]
     rows = re.findall(r"^\|([^|]*)\|", section.partition("\n###")[0], re.MULTILINE)
     named = {name for row in rows for name in INLINE.findall(row)}
-    assert {key for model in models for key in model.__annotations__} - named <= {"model_config"}
+    keys = {key for model in models for key in model.__annotations__} - {"model_config"}
+    assert named == keys
+
+
+@pytest.mark.parametrize(("heading", "model"), [("`truth.json`", Truth), ("a view", TruthView)])
+def test_the_formats_have_the_keys_of_a_truth_and_no_others(heading: str, model: type) -> None:
+    table = text_of(ROOT / "docs" / "formats.md").partition(f"| key of {heading} |")[2]
+    rows = re.findall(r"^\|([^|]*)\|", table.partition("\n\n")[0], re.MULTILINE)
+    named = {name for row in rows for name in INLINE.findall(row)}
+    assert named == set(model.__annotations__)
 
 
 # Files and functions
