@@ -166,6 +166,13 @@ def test_the_formats_have_the_keys_of_a_truth_and_no_others(heading: str, model:
     assert named == set(model.__annotations__)
 
 
+def test_the_readme_has_the_measured_errors_of_auto_exposure() -> None:
+    measured = json.loads(text_of(ROOT / "benchmarks/results/auto_exposure.json"))["results"]
+    for lossless, where in ((True, "EV (median) on lossless frames"), (False, "EV on video")):
+        errors = [clip["median_error"] for clip in measured if clip["lossless"] is lossless]
+        assert f"{min(errors):.2f} to {max(errors):.2f} {where}" in text_of(ROOT / "README.md")
+
+
 # Files and functions
 
 
