@@ -2,8 +2,8 @@
 
     python examples/hdr_video.py OUT/render/training video.mp4 24 1.5
 
-24 frames a second, 1.5 stops brighter: then radiance 1 is diffuse white, 203 nits. Gray
-becomes neutral by the gains in the headers of files that `render` wrote.
+24 frames a second, 1.5 stops brighter than with radiance 1 as diffuse white, 203 nits.
+Gray becomes neutral by the gains in the headers of files that `render` wrote.
 """
 
 from __future__ import annotations
