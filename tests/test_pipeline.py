@@ -256,3 +256,14 @@ def test_other_options_are_refused_before_the_scene_of_a_run_is_replaced(tmp_pat
     (tmp_path / pipeline.OPTIONS).write_text("[1")
     with pytest.raises(InputError, match="damaged"):
         options_for(config)
+
+
+@pytest.mark.parametrize("content", ['{"mine": 1}', "[]", "not JSON"])
+def test_options_of_another_program_stay_where_they_are(
+    content: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pipeline, "prepare_scenes", lambda *_, **__: [])
+    (tmp_path / pipeline.OPTIONS).write_text(content)
+    with pytest.raises(InputError, match=f"{pipeline.OPTIONS}: .* not made by run;"):
+        pipeline.run_all(RunConfig(tmp_path / "clip.mp4", tmp_path))
+    assert (tmp_path / pipeline.OPTIONS).read_text() == content

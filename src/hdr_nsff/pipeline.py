@@ -112,15 +112,11 @@ def options_for(config: RunConfig) -> dict[str, Any]:
     """The options to be kept beside the results. InputError where a run was trained
     with others: its scene would be prepared anew, and no longer fit it.
     """
-    path = config.out / OPTIONS
     own = options_of(config)
+    before = earlier_options(config.out / OPTIONS)
     runs = [config.out / "run", *config.out.glob("*/run")]
     runs = [run for run in runs if any((run / "checkpoints").glob("step_*"))]
-    if runs and path.is_file():
-        try:
-            before = dict(read_json(path))
-        except (ValueError, TypeError) as error:
-            raise InputError(f"{path}: damaged; delete it, or choose another OUT") from error
+    if runs and before:
         if own["minutes"] is None:
             own["minutes"] = before.get("minutes")
         changed = [name for name in own if name in before and before[name] != own[name]]
@@ -131,6 +127,22 @@ def options_for(config: RunConfig) -> dict[str, Any]:
                 f"choose another OUT, or delete {runs[0]} to train again with these"
             )
     return own
+
+
+def earlier_options(path: Path) -> dict[str, Any]:
+    """The options that an earlier command kept at `path`, empty without; InputError for
+    a file that is damaged, or that no `run` wrote.
+    """
+    if not path.exists():
+        return {}
+    advice = "move it away, or choose another OUT"
+    try:
+        before = dict(read_json(path))
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{path}: damaged, or not made by run; {advice}") from error
+    if not before.keys() >= {"clip", "preset"}:
+        raise InputError(f"{path}: already exists and was not made by run; {advice}")
+    return before
 
 
 def options_of(config: RunConfig) -> dict[str, Any]:
