@@ -34,7 +34,7 @@ class CheckConfig:
     """
 
     clip: tyro.conf.Positional[Path]
-    """Footage: a video, a folder of frames, or a folder of such folders."""
+    """Footage: a video, a folder of frames, or a folder of such folders or videos."""
     picture: Path | None = None
     """The picture to write; its folder is made where there is none. Default:
     CLIP_check.png in the current folder.

@@ -58,16 +58,17 @@ class PrepareConfig:
 
     clip: Positional[Path]
     """Footage: a video, a folder of PNG, JPEG, TIFF, EXR or DNG frames, or a folder of
-    such folders, one per synchronized camera. Or a public data set: HDR-GoPro / NSFF
-    (LLFF), D-NeRF, HDR-HexPlane, HDR-4D, HDR-NeRF, nerfstudio; what it gives is used.
+    such folders or videos, one per synchronized camera. Or a public data set: HDR-GoPro
+    / NSFF (LLFF), D-NeRF, HDR-HexPlane, HDR-4D, HDR-NeRF, nerfstudio; what it gives is
+    used.
     """
     out: Positional[Path]
     """Scene folder to write."""
     exposures: str | None = None
     """Exposure times of one cycle in seconds, in the order of the frames:
     1/1000,1/250,1/60. Default: a CSV beside the frames (`exposures.csv`, for a video
-    `CLIP.csv`; columns file or frame, and exposure or ev), else EXIF, else found from
-    brightness.
+    `CLIP.csv`; columns file or frame, and exposure or ev), else EXIF or a GoPro's
+    metadata, else found from brightness.
     """
     ev: str | None = None
     """The same as log2 exposures: -4,-2,0."""

@@ -48,8 +48,8 @@ class ExportConfig:
     Images, poses_bounds.npy, masks, depth, flow and a COLMAP model: hdr-nsff export
     out/scene out/gopro --layout hdr-gopro
 
-    transforms.json, images and depth: hdr-nsff export out/scene out/ns
-    --layout nerfstudio
+    transforms.json, images and depth: hdr-nsff export
+    out/scene out/ns --layout nerfstudio
 
     With held-out views, as recorded: hdr-nsff export out/scene out/ns --layout
     nerfstudio --truth truth

@@ -80,8 +80,8 @@ class SplatConfig:
     radiance: Advanced[Literal["exp", "sigmoid"]] = "exp"
     """Unbounded radiance, or one below 1."""
     readout: Annotated[float | None, Ge(0), Le(1000), arg(aliases=("--readout",))] = None
-    """Milliseconds from a rolling shutter's first row to its last. Default: those that
-    `prepare --readout` was given, else 0.
+    """Milliseconds from a rolling shutter's first row to its last. Default: those
+    of the scene, by `prepare --readout`, else 0.
     """
     shutter: Annotated[Share | Literal["auto"], arg(aliases=("--shutter",))] = 0.0
     """Motion blur: share of the time from frame to frame of the clip for which the

@@ -4,7 +4,7 @@ shared trajectories, and time-local ones for non-rigid motion.
 Color is the exponential of a log radiance, unbounded (a sigmoid bounds it for the
 ablation). Colors of moving Gaussians change in time, and static ones brighten or darken
 slowly (shadows of movers). The number of Gaussians is fixed by the settings; ones that
-fade away draw nothing and cost next to nothing. docs/method.md, section "4D Gaussians".
+fade away draw nothing and cost next to nothing. docs/method.md, section "Gaussians".
 """
 
 from __future__ import annotations
