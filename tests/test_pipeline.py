@@ -236,6 +236,34 @@ def test_a_killed_run_of_segments_goes_on_with_the_segment_that_it_was_in(
         assert (tmp_path / f"out/{name}/report.html").is_file()
 
 
+def test_a_run_killed_in_training_redoes_no_step_under_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same command, or the one without `--redo`, keeps the scene and goes on."""
+    monkeypatch.setitem(
+        PRESETS, "tiny", replace(PRESETS["tiny"], budget=Budget(steps=4, minutes=None))
+    )
+    monkeypatch.setattr(pipeline, "render_all", lambda run, out: {})
+    clip, out, maps = footage(tmp_path / "clip", 12), tmp_path / "out", given(tmp_path / "g", 12)
+    config = RunConfig(clip, out, preset="tiny", device="cpu", redo=("flow",), **maps)
+    train, flow = pipeline.train, out / "scene/raw_flow"
+
+    def killed(settings: TrainConfig) -> Path:
+        train(settings)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pipeline, "train", killed)
+    with pytest.raises(KeyboardInterrupt):
+        pipeline.run_all(config)
+    written = stamps(flow)
+    monkeypatch.setattr(pipeline, "train", train)
+    for again in (config, replace(config, redo=()), config):
+        pipeline.run_all(again)
+        assert written and stamps(flow) == written
+    with pytest.raises(InputError, match=r"other options \(--redo\)"):
+        pipeline.run_all(replace(config, redo=("depth",)))
+
+
 def test_a_truth_of_the_whole_clip_is_refused_for_segments(tmp_path: Path) -> None:
     config = RunConfig(tmp_path, tmp_path, segment=2, truth=truth_of(tmp_path / "truth", (4.0, 4)))
     with pytest.raises(InputError, match="leave --segment or --truth out"):

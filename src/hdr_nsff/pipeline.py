@@ -91,6 +91,8 @@ def run_all(config: RunConfig) -> None:
     results: dict[str, Path] = {}
     with writing_to(config.out), lock_output(config.out):
         options = options_for(config)
+        if trained_runs(config.out) and earlier_options(config.out / OPTIONS):
+            footage = replace(footage, redo=())  # done before that training began
         scenes = prepare_scenes(footage, part_cuts=config.truth is None)
         write_json(config.out / OPTIONS, options)
         truth = config.truth or held_out_truth(footage)
@@ -114,11 +116,11 @@ def options_for(config: RunConfig) -> dict[str, Any]:
     """
     own = options_of(config)
     before = earlier_options(config.out / OPTIONS)
-    runs = [config.out / "run", *config.out.glob("*/run")]
-    runs = [run for run in runs if any((run / "checkpoints").glob("step_*"))]
+    runs = trained_runs(config.out)
     if runs and before:
         if own["minutes"] is None:
             own["minutes"] = before.get("minutes")
+        own["redo"] = own["redo"] or before.get("redo", [])
         changed = [name for name in own if name in before and before[name] != own[name]]
         if changed:
             options = ", ".join("--" + name.replace("_", "-") for name in changed)
@@ -127,6 +129,12 @@ def options_for(config: RunConfig) -> dict[str, Any]:
                 f"choose another OUT, or delete {runs[0]} to train again with these"
             )
     return own
+
+
+def trained_runs(out: Path) -> list[Path]:
+    """The run folders in `out` that hold a checkpoint."""
+    runs = [out / "run", *out.glob("*/run")]
+    return [run for run in runs if any((run / "checkpoints").glob("step_*"))]
 
 
 def earlier_options(path: Path) -> dict[str, Any]:
