@@ -2,8 +2,9 @@
 
 Training path (EXR sequence, LDR views at three exposures, depth and motion pictures)
 and three videos: fixed camera, bullet time where the clip has parallax, slow motion.
-Under a tight budget the training path skips frames; videos shrink first and then keep
-to the middle of the clip. The plan stays in `plan.json`, which a restart follows.
+Under a tight budget the training path skips frames; videos shrink first, and then
+bullet time skips views and the others keep to the middle of the clip. The plan stays in
+`plan.json`, which a restart follows.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 It holds config.json, checkpoints/ (safetensors, newest two kept), snapshots/ where
 `bench` asks for them, log.jsonl and previews/. `Run.open` rebuilds field and tone
-mapper from it alone. Nothing is unpickled; every write is atomic.
+mapper from it alone. Nothing is unpickled; every write but to the log is atomic.
 """
 
 from __future__ import annotations
