@@ -12,7 +12,7 @@ import pytest
 from toy_scene import EV, ToyScene
 
 from hdr_nsff.check import given, lens, measure
-from hdr_nsff.check.check import CheckConfig, check
+from hdr_nsff.check.check import CheckConfig, check, default_picture
 from hdr_nsff.check.facts import CameraFacts, ClipFacts, ExposureFacts, FileFacts, LensFacts
 from hdr_nsff.check.findings import Finding, judge, outlook
 from hdr_nsff.check.measure import measure_clip
@@ -240,6 +240,14 @@ def good_facts() -> ClipFacts:
         ExposureFacts(2, (0.0, 2.0), 0.97, None, 2.0, 0.1, (0.0, 0.2), (0.1, 0.0), 0.0),
         CameraFacts("parallax", 0.2, 3.0, 0.98, ()),
     )
+
+
+def test_folders_whose_names_have_dots_get_a_picture_each(tmp_path: Path) -> None:
+    for day in ("2024.11.29", "2024.11.30"):
+        (tmp_path / day).mkdir()
+        assert default_picture(tmp_path / day) == Path(f"{day}_check.png")
+    (tmp_path / "walk.mp4").touch()
+    assert default_picture(tmp_path / "walk.mp4") == Path("walk_check.png")
 
 
 def test_a_frame_that_is_missing_from_the_cycle_is_found(tmp_path: Path) -> None:

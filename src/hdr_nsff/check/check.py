@@ -47,7 +47,7 @@ class CheckConfig:
 
 def check(config: CheckConfig) -> Path:
     """The verb: the picture that was written."""
-    picture = config.picture or Path(f"{config.clip.resolve().stem}{CHECK_PICTURE}")
+    picture = config.picture or default_picture(config.clip)
     check_place(picture)
     footage = open_clip(config)
     check_no_frame(picture, footage)
@@ -76,6 +76,15 @@ def open_clip(config: CheckConfig) -> Footage:
     if config.same_camera is not None:
         return open_tracks(config.clip, config.same_camera)
     return open_footage(config.clip)
+
+
+def default_picture(clip: Path) -> Path:
+    """The picture of a clip in the current folder. Only a file has an ending to drop:
+    the folders of 2024.11.29 and 2024.11.30 have two pictures.
+    """
+    place = clip.resolve()
+    name = place.name if place.is_dir() else place.stem
+    return Path(f"{name}{CHECK_PICTURE}")
 
 
 def check_place(picture: Path) -> None:
