@@ -15,7 +15,7 @@ COLOR_OFFSET_SHARE = 0.01  # weight of color offsets relative to their changes i
 
 
 def regularizers(model: Model, cloud: GaussianCloud, knot: float) -> dict[str, Tensor]:
-    """The field's own terms of the `cloud` at `knot`, by their `LossWeights` names.
+    """The field's own terms of the `cloud` at `knot`, by their `SplatLosses` names.
 
     Mean opacity and scale keep Gaussians few and small (3DGS-MCMC, Kheradmand et
     al. 2024); the others keep poses smooth and changes in time small.
