@@ -237,7 +237,7 @@ def test_a_killed_run_of_segments_goes_on_with_the_segment_that_it_was_in(
 
 
 def test_a_run_killed_in_training_redoes_no_step_under_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The same command, or the one without `--redo`, keeps the scene and goes on."""
     monkeypatch.setitem(
@@ -260,6 +260,7 @@ def test_a_run_killed_in_training_redoes_no_step_under_it(
     for again in (config, replace(config, redo=()), config):
         pipeline.run_all(again)
         assert written and stamps(flow) == written
+    assert "--redo flow: done before" in capsys.readouterr().err
     with pytest.raises(InputError, match=r"other options \(--redo\)"):
         pipeline.run_all(replace(config, redo=("depth",)))
 

@@ -91,8 +91,11 @@ def run_all(config: RunConfig) -> None:
     results: dict[str, Path] = {}
     with writing_to(config.out), lock_output(config.out):
         options = options_for(config)
-        if trained_runs(config.out) and earlier_options(config.out / OPTIONS):
-            footage = replace(footage, redo=())  # done before that training began
+        runs = trained_runs(config.out)
+        if footage.redo and runs and earlier_options(config.out / OPTIONS):
+            reason = f"done before {runs[0]} was trained; delete that to do it once more"
+            say(f"--redo {' '.join(footage.redo)}: {reason}")
+            footage = replace(footage, redo=())
         scenes = prepare_scenes(footage, part_cuts=config.truth is None)
         write_json(config.out / OPTIONS, options)
         truth = config.truth or held_out_truth(footage)

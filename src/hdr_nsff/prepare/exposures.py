@@ -1,8 +1,8 @@
 """The exposure of every frame of a clip in `prepare`: given, or by brightness.
 
-Exposures come from the command line, a data set, a CSV or EXIF, in this order; where
-none of these has them, frames of one exposure are found by their brightness, and
-training learns the exposures.
+Exposures come from the command line, a data set, a CSV, or EXIF or a GoPro's metadata,
+in this order; where none of these has them, frames of one exposure are found by their
+brightness, and training learns the exposures.
 """
 
 from __future__ import annotations
