@@ -8,7 +8,7 @@ FlyingThings3D. The output folder then holds
   --flow-weights`;
 - `weights.json`: its settings and data, and its error on held-out pairs before and
   after;
-- `config.json`, `checkpoints/`: what a restart needs after a kill.
+- `config.json`, `before.json`, `checkpoints/`: what a restart needs after a kill.
 
 Every step has a random generator, seeded by the step. A killed run that continues
 therefore ends like an unbroken one.
