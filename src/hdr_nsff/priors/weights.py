@@ -3,9 +3,9 @@
 This project carries none. `find` looks, in this order, at a path the user gives, in
 `NAME/` of the cache folder (`~/.cache/hdr-nsff/weights`, or `$HDR_NSFF_WEIGHTS`),
 inside an installed package that ships them (found without importing it), in the Hugging
-Face hub's own cache, and last on the network; with `HF_HUB_OFFLINE=1` the network is
-not used. Files whose hash is known must have it, so a broken or changed file is
-refused. The weights by name stand in `known_weights.py`.
+Face hub's own cache, and last on the network, but for what a package alone ships; with
+`HF_HUB_OFFLINE=1` the network is not used. Files whose hash is known must have it, so a
+broken or changed file is refused. The weights by name stand in `known_weights.py`.
 """
 
 from __future__ import annotations
