@@ -217,6 +217,15 @@ def test_the_verb_writes_beside_the_run(tmp_path: Path, monkeypatch: pytest.Monk
     assert (tmp_path / "report.html").stat().st_size > 10_000
 
 
+def test_the_verb_finds_the_videos_of_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Run, "open", staticmethod(lambda folder: fake_run(Path(folder))))
+    (tmp_path / "run").mkdir()
+    (tmp_path / "render").mkdir()
+    (tmp_path / "render/training.mp4").write_bytes(b"a video")
+    text, _ = read(report(ReportConfig(tmp_path / "run")))
+    assert "data:video/mp4" in text
+
+
 @pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="not Linux")
 def test_a_report_is_not_written_over_devices_or_below_proc(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -34,6 +34,7 @@ from hdr_nsff.evaluation.report.provenance import (
     timing_table,
 )
 from hdr_nsff.evaluation.report.score_tables import headline_of, quality_tables
+from hdr_nsff.rendering.output import render_folders
 from hdr_nsff.training.run_folder import Run
 
 MARK = b"HDR-NSFF report"  # in the title of every page
@@ -50,17 +51,21 @@ class ReportConfig:
     out: Path | None = None
     """The file; default: RUN/report.html."""
     renders: Path | None = None
-    """Folder of the files of `render`; default: RUN/render."""
+    """Folder of the files of `render`; default: RUN/render, or where there is none, the
+    folder render/ that `run` made beside RUN.
+    """
 
 
 def report(config: ReportConfig) -> Path:
     """The verb: the path of the report."""
     out = config.out or config.run / "report.html"
     if config.renders is not None and not config.renders.is_dir():
-        advice = "correct the path, or leave the option out for RUN/render"
+        advice = "correct the path, or leave the option out"
         raise InputError(f"--renders {config.renders}: no such folder; {advice}")
+    places = render_folders(config.run)
+    renders = config.renders or next((place for place in places if place.is_dir()), places[0])
     with writing_to(out):
-        path = write_report(Run.open(config.run), out, config.renders or config.run / "render")
+        path = write_report(Run.open(config.run), out, renders)
     say(f"report: {path}")
     return path
 
