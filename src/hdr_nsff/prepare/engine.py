@@ -3,7 +3,8 @@
 A step is a function from what the folder holds so far (`Work`) to a `StepResult`. Its
 key is a hash of its settings, of the files these name, of the weights of its networks,
 and of the steps before it. A finished step with the same key is skipped. One with
-another key starts over, and so does every step that builds on it.
+another key starts over, and so does every step that builds on it: these count as not
+done from then on, so that nobody takes a scene that is redone in part for a whole one.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.hashes import hash_file
@@ -66,6 +67,8 @@ def run_step(work: Work, name: StepName, step: Step) -> None:
         set_aside(work.folder, step.outputs)
     record = begun or next_attempt(before, key)
     records[name] = record.model_copy(update={"done": False})
+    if begun is None:
+        begin_later_steps(records, name)
     work.save()
     start, cpu_before = time.monotonic(), cpu_seconds()
     try:
@@ -134,6 +137,16 @@ def next_attempt(record: StepRecord | None, key: str) -> StepRecord:
     """The record of a step that starts over; the steps after it then do so too."""
     attempt = record.details.get("attempt", 0) + 1 if record else 1
     return StepRecord(key=key, details={"attempt": attempt})
+
+
+def begin_later_steps(records: dict[str, StepRecord], name: StepName) -> None:
+    """Let the steps after one that starts over count as not done: each builds on those
+    before it.
+    """
+    order = get_args(StepName)
+    for later in order[order.index(name) + 1 :]:
+        if later in records:
+            records[later] = records[later].model_copy(update={"done": False})
 
 
 def step_key(work: Work, name: StepName, step: Step) -> str:

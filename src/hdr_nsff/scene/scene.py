@@ -199,7 +199,22 @@ def check_complete(folder: Path, m: Manifest) -> tuple[float, float]:
         raise InputError(
             f"{folder}: the scene has no camera poses yet; {again}, it continues where it stopped"
         )
+    if step := unfinished_step(m):
+        raise InputError(
+            f"{folder}: `prepare` has not finished the step {step} of this scene; "
+            f"{again}, it continues where it stopped"
+        )
     return m.near, m.far
+
+
+def unfinished_step(m: Manifest) -> str | None:
+    """The first step of `prepare` that training needs and that has not finished, None
+    where all have, or the scene was made otherwise. The contact sheet is for people.
+    """
+    started = {name: step.done for name, step in m.steps.items() if name != "sheet"}
+    if "movers" in started:  # which `prepare` alone finds
+        started.setdefault("depth", False)
+    return next((name for name, done in started.items() if not done), None)
 
 
 def load_response(folder: Path, m: Manifest) -> Response:
