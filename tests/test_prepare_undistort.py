@@ -106,6 +106,23 @@ def test_a_command_that_is_stopped_meanwhile_ends_at_the_same(scene, footage, tm
     run_steps(begin(config), nothing)  # all is done
 
 
+def test_frames_that_are_redone_start_over_once_and_their_flow_never(footage, tmp_path):
+    begun = []
+
+    def counted(name):
+        def run(work):
+            begun.append(name)
+            return STEPS[name].run(work)
+
+        return replace(STEPS[name], run=run)
+
+    config = PrepareConfig(footage, tmp_path / "scene", redo=("frames",))
+    run_steps(begin(config), {name: counted(name) for name in UP_TO_POSES})
+    once_more = ["frames", "exposure", "poses"]
+    assert begun == [*UP_TO_POSES, *once_more]
+    assert (config.out / UNDISTORTED_FLOW).is_dir()
+
+
 def test_given_maps_are_undistorted_like_the_frames_whenever_they_are_read(tmp_path):
     square = np.zeros((H, W), bool)
     square[4:20, 6:26] = True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 from hdr_nsff.prepare.engine import Step, all_have, run_step
 from hdr_nsff.prepare.given_maps import check_given_maps
@@ -30,6 +31,7 @@ def run_steps(work: Work, steps: Mapping[StepName, Step]) -> None:
             run_step(work, name, step)
     except DistortedFramesError as distorted:
         start_over(work, steps, distorted.lenses)
+        work.config = replace(work.config, redo=())  # all is redone, but for the flow
         for name, step in steps.items():
             run_step(work, name, step)
 
