@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import shutil
 import time
 import tracemalloc
 from dataclasses import replace
@@ -126,6 +127,20 @@ def test_killed_at_any_moment_segments_continue_to_the_same_scenes(config, tmp_p
     for name in files:
         if name.name != "scene.json":
             assert (config.out / name).read_bytes() == (again.out / name).read_bytes(), name
+
+
+def test_given_flow_across_held_out_frames_stays_in_every_segment(config, tmp_path):
+    flow = shutil.copytree(config.flow, tmp_path / "flow")
+    held_out = {f.source for f in Manifest.load(config.out / "clip").frames if f.split == "test"}
+    for path in flow.iterdir():
+        i, j = sorted(int(number) for number in path.stem.split("_"))
+        if j - i == 2 and f"{i + 1:03d}.png" not in held_out:
+            path.unlink()  # training asks for no such pair
+    prepare(replace(config, out=tmp_path / "out", flow=flow))
+    for k in range(2):
+        m = Manifest.load(tmp_path / f"out/segment_{k:02d}")
+        used = [files.flow for f in m.frames for files in f.flow.values()]
+        assert used and all(name.startswith("raw_flow/") for name in used)
 
 
 def peak_of_segments(config: PrepareConfig, monkeypatch: pytest.MonkeyPatch) -> int:

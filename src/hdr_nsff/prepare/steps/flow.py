@@ -185,8 +185,10 @@ def flow_is_given(work: Work, i: int, j: int) -> bool:
     """
     frames, folder = work.manifest.frames, work.config.flow
     if isinstance(folder, Path):
-        return bool(pairs_of_folder(folder, frames, [(i, j), (j, i)]))
+        a, b = (i, j) if work.segment is None else (work.segment.rows[i], work.segment.rows[j])
+        named = pair_file(folder, a, b) or pair_file(folder, b, a)  # by frames of the whole clip
+        return named is not None or not is_across_held_out(frames, (i, j))
     if work.capture_with("flow") is None:
         return False
-    a, b = frames[i], frames[j]
-    return b.source in work.picture(a).flow or a.source in work.picture(b).flow
+    here, there = frames[i], frames[j]
+    return there.source in work.picture(here).flow or here.source in work.picture(there).flow
