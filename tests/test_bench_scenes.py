@@ -4,6 +4,7 @@ sentences that refuse the rest.
 
 from __future__ import annotations
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,9 @@ from toy_scene import ToyScene, camera_center
 from hdr_nsff.bench.config import BenchConfig, BenchScene
 from hdr_nsff.bench.scenes import parse_scene
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.footage.layouts import nerfstudio
+from hdr_nsff.footage.layouts.writer import Source
+from hdr_nsff.prepare.prepare import STEPS
 from hdr_nsff.synth.oracle import ORACLE_NOTE
 
 
@@ -114,3 +118,19 @@ def test_footage_alone_is_prepared_and_measured_on_its_held_out_frames(tmp_path:
     assert scene.name == "walk" and scene.truth is None
     assert scene.footage is not None and scene.footage.clip == frames
     assert scene.footage.hold_out is None  # `prepare` chooses which
+
+
+@pytest.mark.parametrize("held_out", [False, True])
+def test_a_prepared_data_set_is_ready_once_its_held_out_views_are_written(
+    held_out: bool, toy_folder: Path, tmp_path: Path
+) -> None:
+    data_set, name = tmp_path / "set", "transforms.json"
+    nerfstudio.write(Source.open(toy_folder), data_set)
+    if held_out:
+        images = [f["file_path"] for f in json.loads((data_set / name).read_text())["frames"]]
+        split = {"train_filenames": images[:-1], "test_filenames": images[-1:]}
+        edit(data_set / name, lambda d: d.update(split))
+    scene = parse(data_set, tmp_path / "out")
+    shutil.copytree(toy_folder, scene.folder)
+    edit(scene.folder / "scene.json", lambda m: m.update(steps={s: {"done": True} for s in STEPS}))
+    assert scene.truth is None and scene.ready != held_out

@@ -20,7 +20,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.footage.datasets import layout_of
+from hdr_nsff.footage.datasets import recognize
 from hdr_nsff.prepare.prepare import STEPS, PrepareConfig, held_out_truth
 from hdr_nsff.scene.manifest import Manifest, Protocol
 from hdr_nsff.training.config import TrainConfig
@@ -111,7 +111,7 @@ class BenchScene:
             return False
         steps = Manifest.load(self.folder).steps
         done = all(name in steps and steps[name].done for name in STEPS)
-        return done and (self.truth is not None or layout_of(self.footage.clip) is None)
+        return done and (self.truth is not None or not holds_views_out(self.footage.clip))
 
     @property
     def truth(self) -> Path | None:
@@ -185,6 +185,12 @@ class BenchPlan:
                 config = replace(method, scene=scene.folder, out=folder)
                 runs.append(BenchRun(scene, name, config, out))
         return tuple(runs)
+
+
+def holds_views_out(clip: Path) -> bool:
+    """Whether a clip is a public data set with held-out views, which become a truth."""
+    capture = recognize(clip)
+    return capture is not None and capture.has_held_out
 
 
 def safe_name(text: str, option: str) -> str:
