@@ -10,6 +10,7 @@ import resource
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -27,8 +28,14 @@ from bad_input import (
 )
 
 from hdr_nsff import cli
+from hdr_nsff.bench import plan
+from hdr_nsff.bench.config import BenchConfig
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import HOST, write_npy, writing_to
+from hdr_nsff.core.io import HOST, remove_leftovers, write_npy, writing_to
+from hdr_nsff.flow_training import finetune_flow
+from hdr_nsff.footage.datasets import held_out
+from hdr_nsff.synth import synth
+from hdr_nsff.synth.settings import SynthConfig
 
 # A full disk
 
@@ -207,3 +214,36 @@ def test_reexpose_writes_into_a_folder_that_holds_leftovers_of_killed_processes_
     (out / name).write_bytes(b"half")
     call(*command)
     assert (out / name).exists() != works and (out / "reexpose.json").exists() == works
+
+
+def claim_of(verb: str, out: Path, scene: Path) -> Callable[[], object]:
+    """What a verb does first: it makes the folder `out` its own."""
+    match verb:
+        case "bench":
+            return lambda: plan.claim(plan.make_plan(BenchConfig(out, str(scene), "tiny")))
+        case "finetune-flow":
+            return lambda: finetune_flow.claim_folder(finetune_flow.FinetuneConfig(out))
+        case "synth":
+            return lambda: synth.claim(SynthConfig("lamp", out))
+    return lambda: held_out.claim_folder(out, "a" * 64)
+
+
+@pytest.mark.parametrize("verb", ["bench", "finetune-flow", "synth", "prepare"])
+def test_a_verb_that_was_killed_while_it_claimed_its_folder_claims_it_again(
+    verb: str, toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    claim, replace = claim_of(verb, out, toy_folder), os.replace
+
+    def killed(source: Path, target: Path) -> None:
+        replace(source, Path(target).parent / LEFTOVER)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", killed)
+        with pytest.raises(KeyboardInterrupt):
+            claim()
+    assert [path.name for path in out.rglob("*") if path.is_file()] == [LEFTOVER]
+    remove_leftovers.cache_clear()  # as in another process
+    claim()
+    assert [path.suffix for path in out.rglob("*") if path.is_file()] == [".json"]

@@ -25,6 +25,7 @@ from hdr_nsff.core.io import (
     HOST,
     TOKEN,
     atomic,
+    holds_nothing,
     is_leftover,
     read_json,
     read_npy,
@@ -43,6 +44,16 @@ def leftover(folder: Path, host: str = HOST, pid: int = DEAD, token: str = "0" *
     path = folder / f".partial-{host}-{pid}-{token}-abcd_123.png"
     path.write_bytes(b"half")
     return path
+
+
+def test_a_folder_with_unfinished_files_of_killed_processes_alone_holds_nothing(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "exact").mkdir()
+    leftover(tmp_path), leftover(tmp_path / "exact")
+    assert holds_nothing(tmp_path) and not holds_nothing(leftover(tmp_path))
+    (tmp_path / "exact/notes.txt").write_text("mine")
+    assert not holds_nothing(tmp_path) and not holds_nothing(tmp_path / "missing")
 
 
 # Atomic writes

@@ -14,7 +14,7 @@ from hdr_nsff.bench.methods import parse_method
 from hdr_nsff.bench.scenes import parse_scene
 from hdr_nsff.core import notes
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import SCENE_FILE
+from hdr_nsff.core.io import SCENE_FILE, holds_nothing
 from hdr_nsff.core.progress import say
 from hdr_nsff.evaluation.report import check_place
 from hdr_nsff.footage.frame_choice import check_max_size
@@ -84,7 +84,7 @@ def claim(plan: BenchPlan) -> None:
     path = out / "bench.json"
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; choose a folder")
-    if not path.is_file() and out.is_dir() and any(out.iterdir()):
+    if not path.is_file() and out.is_dir() and not holds_nothing(out):
         raise InputError(
             f"{out}: holds other files and no benchmark; choose an empty or new folder"
         )

@@ -90,6 +90,18 @@ def is_leftover(path: Path) -> bool:
     return not is_alive(int(found["pid"]))
 
 
+def holds_nothing(folder: Path) -> bool:
+    """Whether a folder is empty, but for folders that are so too, and for unfinished
+    files of killed processes.
+    """
+
+    def counts(path: Path) -> bool:
+        is_folder = path.is_dir() and not path.is_symlink()
+        return not (holds_nothing(path) if is_folder else is_leftover(path))
+
+    return folder.is_dir() and not any(counts(path) for path in folder.iterdir())
+
+
 def is_alive(pid: int) -> bool:
     """Whether a process of this number runs on this machine."""
     try:

@@ -31,7 +31,7 @@ from tyro.conf import Positional
 from hdr_nsff.core import notes
 from hdr_nsff.core.checkpoints import latest_checkpoint, pack, save_checkpoint, unpack
 from hdr_nsff.core.errors import InputError, shorten
-from hdr_nsff.core.io import atomic, read_json, write_json, writing_to
+from hdr_nsff.core.io import atomic, holds_nothing, read_json, write_json, writing_to
 from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.core.tensors import pick_device
@@ -211,7 +211,7 @@ def claim_folder(config: FinetuneConfig) -> None:
                 f"{config.out}: holds a run with other settings; choose a new folder, "
                 "or repeat its command"
             )
-    elif config.out.exists() and any(config.out.iterdir()):
+    elif config.out.exists() and not holds_nothing(config.out):
         raise InputError(f"{config.out}: holds other files; choose an empty or new folder")
     write_json(path, settings)
 

@@ -28,7 +28,7 @@ from hdr_nsff.core.exr import write_exr
 from hdr_nsff.core.hashes import hash_file
 from hdr_nsff.core.hdr_video import Codec
 from hdr_nsff.core.images import read_mask, write_png
-from hdr_nsff.core.io import is_leftover, read_json, write_json, writing_to
+from hdr_nsff.core.io import holds_nothing, read_json, write_json, writing_to
 from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage.bars import with_bars
@@ -255,7 +255,7 @@ def claim(config: ReexposeConfig, footage: Footage, jumps: Mapping[int, float]) 
                 f"{config.out}: holds another clip, or one made with other settings; "
                 "choose another folder"
             )
-    elif config.out.exists() and not is_empty_folder(config.out):
+    elif config.out.exists() and not holds_nothing(config.out):
         raise InputError(
             f"{config.out}: already exists and was not made by reexpose; "
             "choose an empty or new folder"
@@ -271,11 +271,6 @@ def same_problem(path: Path, settings: dict[str, Any]) -> bool:
         return {**read_json(path), "clip": ""} == {**settings, "clip": ""}
     except (ValueError, TypeError):
         return False
-
-
-def is_empty_folder(path: Path) -> bool:
-    """Whether a folder holds nothing but unfinished files of a killed run."""
-    return path.is_dir() and all(is_leftover(entry) for entry in path.iterdir())
 
 
 def plan_frames(count: int, cycle: int, hold_out: int, remove: bool) -> FramePlan:

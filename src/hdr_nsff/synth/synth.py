@@ -36,7 +36,7 @@ import numpy as np
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import MOTION_DIRECTIONS, REC709, read_exr, write_exr
 from hdr_nsff.core.images import write_png
-from hdr_nsff.core.io import write_json, write_text, writing_to
+from hdr_nsff.core.io import holds_nothing, write_json, write_text, writing_to
 from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.core.video import DEFAULT_FPS, write_video
@@ -148,7 +148,7 @@ def claim(config: SynthConfig) -> None:
             f"{config.out}: holds a scene rendered with other settings; "
             "choose another folder or remove it"
         )
-    if not path.is_file() and config.out.exists() and any(config.out.iterdir()):
+    if not path.is_file() and config.out.exists() and not holds_nothing(config.out):
         raise InputError(f"{config.out}: holds other files; choose a new or an empty folder")
     write_json(path, {"digest": digest, **key})
 

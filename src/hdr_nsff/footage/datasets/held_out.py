@@ -26,7 +26,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import read_exr, write_exr
 from hdr_nsff.core.hashes import hash_file
 from hdr_nsff.core.images import read_image, write_png
-from hdr_nsff.core.io import write_json
+from hdr_nsff.core.io import holds_nothing, write_json
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage.datasets import maps
 from hdr_nsff.footage.datasets.capture import Capture, select_poses
@@ -288,7 +288,7 @@ def claim_folder(out: Path, key: str) -> bool:
             return False
         return all((out / name).is_file() for v in Truth.open(out).views for name in v.files)
     is_ours = (out / NOTE).is_file()
-    if out.exists() and not is_ours and (not out.is_dir() or any(out.iterdir())):
+    if out.exists() and not is_ours and not holds_nothing(out):
         raise InputError(
             f"{out}: already exists and was not made by prepare; "
             "choose another place with --truth-out"
