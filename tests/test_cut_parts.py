@@ -134,6 +134,15 @@ def test_parts_of_other_frames_are_refused(tmp_path: Path) -> None:
     assert sources(tmp_path / "out/part_01") == before
 
 
+def test_parts_are_named_where_segments_or_one_scene_are_asked_for(tmp_path: Path) -> None:
+    config = PrepareConfig(clip_of(tmp_path / "clip", 20, 14), tmp_path / "out")
+    prepare_scenes(config)
+    with pytest.raises(InputError, match=r"holds the parts of a clip in which the picture cuts"):
+        prepare_scenes(replace(config, segment=1.0))
+    with pytest.raises(InputError, match=r"parts of a clip with cuts; .* such as .*part_00"):
+        Manifest.load(config.out)
+
+
 def test_a_part_that_is_too_short_is_left_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

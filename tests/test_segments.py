@@ -245,6 +245,8 @@ def test_segments_do_not_go_into_a_folder_with_something_else(config, tmp_path):
     ):
         with pytest.raises(InputError, match=sentence):
             prepare(replace(config, out=out))
+    with pytest.raises(InputError, match="holds the segments of a long clip; give --segment"):
+        prepare(replace(config, segment=None))
 
 
 def test_folders_of_an_earlier_cut_are_named(config, tmp_path, capsys):

@@ -43,6 +43,15 @@ def known_parts(config: PrepareConfig) -> list[ClipPart] | None:
     return note.parts
 
 
+def refuse_parts(out: Path) -> None:
+    """InputError where the folder `out` holds the parts of a clip, for `--segment`."""
+    if (out / PARTS).is_file():
+        raise InputError(
+            f"{out}: holds the parts of a clip in which the picture cuts; choose another folder "
+            "for segments (of one part with --start and --end)"
+        )
+
+
 def choice_of(config: PrepareConfig) -> dict[str, int | None]:
     """The choice of frames."""
     return {"start": config.start, "end": config.end, "stride": config.stride}

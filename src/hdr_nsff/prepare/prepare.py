@@ -37,6 +37,7 @@ from hdr_nsff.prepare.cut_parts import (
     longest,
     part_at_cuts,
     part_settings,
+    refuse_parts,
     with_exposures_of,
 )
 from hdr_nsff.prepare.engine import found_manifest
@@ -75,6 +76,7 @@ def prepare_scenes(config: PrepareConfig, part_cuts: bool = True) -> list[Path]:
     """
     with writing_to(config.out), lock_output(config.out):
         if config.segment is not None:
+            refuse_parts(config.out)
             check_segments(config)
             return prepare_segments(begin(replace(config, out=config.out / CLIP_FOLDER)))
         bring_back_clip(config.out)

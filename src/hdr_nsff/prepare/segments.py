@@ -89,11 +89,16 @@ def check_place(out: Path) -> None:
 
 def bring_back_clip(out: Path) -> None:
     """Make what was found of a clip that could not be cut the scene in `out`, for a
-    command without `--segment`.
+    command without `--segment`. InputError where it was cut.
     """
     clip = out / CLIP_FOLDER
     if not (clip / SCENE_FILE).is_file() or (out / SCENE_FILE).exists():
         return
+    if any(out.glob(f"segment_*/{SCENE_FILE}")):
+        raise InputError(
+            f"{out}: holds the segments of a long clip; give --segment too, or choose another "
+            "folder for one scene"
+        )
     if any(path != clip and not is_leftover(path) for path in out.iterdir()):
         return
     (clip / SCENE_FILE).rename(out / SCENE_FILE)  # first: then a kill loses steps at most

@@ -226,11 +226,11 @@ class Manifest(Strict):
         version or makes no sense.
         """
         path = Path(folder) / "scene.json"
-        segment = Path(folder) / "segment_00"
-        if not path.is_file() and segment.is_dir():
-            raise InputError(
-                f"{folder}: holds the segments of a long clip; name one of them, such as {segment}"
-            )
+        scenes = {"segment_00": "segments of a long clip", "part_00": "parts of a clip with cuts"}
+        for name, those in scenes.items():
+            first = Path(folder) / name
+            if not path.is_file() and first.is_dir():
+                raise InputError(f"{folder}: holds the {those}; name one of them, such as {first}")
         if Path(folder).is_file():
             raise InputError(f"{folder}: is a file, no scene; name the folder with scene.json")
         if not path.is_file():
