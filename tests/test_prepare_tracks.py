@@ -90,3 +90,21 @@ def test_exported_to_nerfstudio_tracks_become_cameras(config: PrepareConfig) -> 
     again = prepare(PrepareConfig(out, config.out.with_name("again"), hold_out=0, flow="dis"))
     cameras = [f.camera_id for f in Manifest.load(again).frames]
     assert cameras == [0] * COUNT + [1] * COUNT
+
+
+def test_given_maps_of_tracks_are_found_by_the_names_of_the_tracks(config: PrepareConfig) -> None:
+    width = {"bright": 8, "dark": 4}  # of what moves, in the mask of either
+    for name, columns in width.items():
+        for t in range(COUNT):
+            mask = np.arange(W)[None, :].repeat(H, 0) < columns
+            write_png(config.clip.with_name("masks") / name / f"{t:03d}.png", mask)
+    masks = config.clip.with_name("masks")
+    for order in (("bright", "dark"), ("dark", "bright")):
+        changes = {"same_camera": order, "masks": masks, "out": config.out / order[0]}
+        scene = Scene.open(prepare(replace(config, **changes)))
+        for f, frame in zip(scene.manifest.frames, scene.train, strict=True):
+            assert frame.moving is not None
+            assert frame.moving.sum() == H * width[Path(f.source).parent.name]
+    (masks / "dark/011.png").rename(masks / "bright/012.png")
+    with pytest.raises(InputError, match=r"--mask .*: 13 in bright and 11 in dark; every camera"):
+        prepare(replace(config, masks=masks, out=config.out / "moved"))

@@ -63,15 +63,8 @@ def given_files(work: Work, option: str, folder: Path, suffixes: set[str]) -> li
     """The file for each frame in the user's folder of maps: as many files as frames, in
     order (of each camera, in a folder like the footage's).
     """
-    folders = [folder]
-    if len(work.footage.cameras) > 1:
-        folders = sorted_folders(folder)
-    found = [
-        path
-        for each in folders
-        for path in sorted(each.iterdir(), key=natural_key)
-        if path.suffix.lower() in suffixes and not path.name.startswith(".")
-    ]
+    of_folder = {each: maps_in(each, suffixes) for each in map_folders(work, folder)}
+    found = [path for own in of_folder.values() for path in own]
     count = len(work.manifest.frames)
     rows: Sequence[int] = range(count)
     if work.segment is not None:
@@ -81,7 +74,32 @@ def given_files(work: Work, option: str, folder: Path, suffixes: set[str]) -> li
             f"{option} {folder}: {len(found)} maps for {count} frames{without_map(work, found)}; "
             f"one per used frame, in order; {ADVICE}"
         )
+    counts = {each.name: len(own) for each, own in of_folder.items() if own}
+    if work.capture is None and len(set(counts.values())) > 1:
+        listed = " and ".join(f"{number} in {name}" for name, number in counts.items())
+        raise InputError(
+            f"{option} {folder}: {listed}; every camera needs one per used frame; {ADVICE}"
+        )
     return [found[row] for row in rows]
+
+
+def map_folders(work: Work, folder: Path) -> list[Path]:
+    """The folders of maps, in the order of the cameras or tracks: by their names, else
+    sorted as cameras are.
+    """
+    cameras = work.footage.cameras
+    if len(cameras) == 1:
+        return [folder]
+    names = [own[0].stem if work.footage.video else own[0].parent.name for own in cameras]
+    named = [folder / name for name in names]
+    distinct = len(set(names)) == len(names)
+    return named if distinct and all(each.is_dir() for each in named) else sorted_folders(folder)
+
+
+def maps_in(folder: Path, suffixes: set[str]) -> list[Path]:
+    """The maps directly in a folder, in order."""
+    shown = [path for path in folder.iterdir() if not path.name.startswith(".")]
+    return sorted((p for p in shown if p.suffix.lower() in suffixes), key=natural_key)
 
 
 def without_map(work: Work, found: list[Path]) -> str:
