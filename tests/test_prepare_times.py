@@ -10,6 +10,7 @@ from test_exposure_cycle import clip
 from test_ingest import write_held_video
 from test_prepare_footage import work_on
 
+from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import write_png
 from hdr_nsff.footage.footage import open_footage
 from hdr_nsff.prepare.prepare import PrepareConfig
@@ -158,6 +159,12 @@ def test_cameras_of_a_rig_take_turns_across_a_gap(tmp_path: Path) -> None:
     work = stamped(tmp_path, {"": KEPT}, rig=5)
     exposure_step(work)
     assert work.manifest.places == (KEPT % 5).tolist()
+
+
+def test_a_camera_of_a_rig_whose_frames_are_all_missing_is_named(tmp_path: Path) -> None:
+    work = stamped(tmp_path, {"": np.delete(np.arange(27), [3, 12, 21])}, rig=9)
+    with pytest.raises(InputError, match=r"--rig 9: of camera 3, .* all frames are missing"):
+        exposure_step(work)
 
 
 def test_cameras_that_miss_different_frames_have_times_of_their_own(tmp_path: Path) -> None:

@@ -287,6 +287,13 @@ def cameras_in_turn(work: Work) -> int:
             f"--rig {given}: only {count} frames; each camera needs at least two, "
             "to separate movers from the static scene; correct the number"
         )
+    seen = {round(f.time) % given for f in work.manifest.frames}
+    if len(seen) < given:
+        absent = min(set(range(given)) - seen)
+        raise InputError(
+            f"--rig {given}: of camera {absent}, counted from 0, all frames are missing by their "
+            "times; correct the number, or the times in the list of exposures"
+        )
     return given
 
 
