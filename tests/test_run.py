@@ -21,6 +21,7 @@ from hdr_nsff.core.checkpoints import (
     save_checkpoint,
 )
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.scene.manifest import Manifest, StepRecord
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.training.budget import Budget, Clock, Schedule
 from hdr_nsff.training.config import TrainConfig
@@ -236,6 +237,48 @@ def test_a_scene_that_was_moved_is_named(run: Path) -> None:
     change_config(run, lambda d: d.update(nowhere))
     with pytest.raises(InputError, match="its scene is not at /nowhere/scene any more"):
         Run.open(run)
+
+
+def move_a_camera(m: Manifest) -> None:
+    c2w = m.frames[2].c2w
+    assert c2w is not None
+    c2w[0][3] += 0.01
+
+
+def correct_an_exposure(m: Manifest) -> None:
+    m.frames[2].bracket = 0
+
+
+@pytest.mark.parametrize("change", [move_a_camera, correct_an_exposure])
+def test_a_scene_that_was_changed_under_its_run_is_named(
+    change: Callable[[Manifest], None],
+    toy_folder: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    scene = shutil.copytree(toy_folder, tmp_path / "scene")
+    config = small("tiny", scene, tmp_path / "run")
+    train(config)
+    m = Manifest.load(scene)
+    m.steps["frames"] = StepRecord(done=True, seconds=3.0)  # as of a step that was done again
+    m.save(scene)
+    Run.open(train(config))
+    assert "was changed" not in capsys.readouterr().err
+    change(m)
+    m.save(scene)
+    Run.open(config.out)
+    assert f"its scene {scene} was changed, frames, cameras" in unwrapped(capsys)
+    with pytest.raises(InputError, match="before that was changed, frames, cameras"):
+        train(config)
+    shutil.rmtree(config.out / "checkpoints")
+    train(config)  # nothing was learned yet
+    Run.open(config.out)
+    assert "was changed" not in capsys.readouterr().err
+
+
+def unwrapped(capsys: pytest.CaptureFixture[str]) -> str:
+    """What was printed, without line breaks."""
+    return " ".join(capsys.readouterr().err.split())
 
 
 def test_a_checkpoint_of_another_network_does_not_fit(run: Path) -> None:

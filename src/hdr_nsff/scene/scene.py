@@ -8,7 +8,9 @@ scene lies outside, see `truth.py`; nothing here can read it.
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import itertools
+import json
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, field
@@ -215,6 +217,18 @@ def unfinished_step(m: Manifest) -> str | None:
     if "movers" in started:  # which `prepare` alone finds
         started.setdefault("depth", False)
     return next((name for name, done in started.items() if not done), None)
+
+
+def training_key(m: Manifest) -> str | None:
+    """A hash of what of a scene cannot change under a trained run: its frames, their
+    cameras, times and exposures, and which are held out; None while `prepare` is at it.
+    """
+    if unfinished_step(m) is not None or any(f.c2w is None for f in m.frames):
+        return None
+    names = {"time", "camera_id", "track", "bracket", "split", "K", "c2w"}
+    frames = [f.model_dump(include=names) for f in m.frames]
+    values = [m.width, m.height, m.bracket_ev, m.reference_bracket, frames]
+    return hashlib.sha256(json.dumps(values).encode()).hexdigest()[:16]
 
 
 def load_response(folder: Path, m: Manifest) -> Response:

@@ -16,15 +16,23 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from hdr_nsff.core.checkpoints import latest_checkpoint, read_checkpoint, unpack, write_checkpoint
+from hdr_nsff.core.checkpoints import (
+    checkpoint_files,
+    latest_checkpoint,
+    read_checkpoint,
+    unpack,
+    write_checkpoint,
+)
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import write_png
 from hdr_nsff.core.io import SCENE_FILE, read_json, write_json
 from hdr_nsff.core.notes import LogLine
+from hdr_nsff.core.progress import say
 from hdr_nsff.fields.base import RadianceField
 from hdr_nsff.fields.build import build_field, device_for
 from hdr_nsff.fields.outputs import record_pixels
-from hdr_nsff.scene.scene import Frame, Scene
+from hdr_nsff.scene.manifest import Manifest
+from hdr_nsff.scene.scene import Frame, Scene, training_key
 from hdr_nsff.tonemap.base import ToneMapper
 from hdr_nsff.tonemap.build import tone_mapper_for
 from hdr_nsff.training.budget import Budget, Clock
@@ -32,7 +40,9 @@ from hdr_nsff.training.config import TrainConfig
 from hdr_nsff.training.pose_corrections import poses_for
 
 CONFIG = "config.json"
-SCENE_FROM_RUN = "scene_from_run"  # key of config.json: the scene's path from the run folder
+# keys of config.json: the scene's path from the run folder, and `training_key`
+SCENE_FROM_RUN, SCENE_KEY = "scene_from_run", "scene_key"
+CHANGED = "frames, cameras, exposures or what is held out are not those that it was trained with"
 
 
 def keep_snapshot(
@@ -82,6 +92,8 @@ class Run:
         modules = {"field": field, "tonemapper": tonemapper, "poses": poses}
         unpack(found.tensors, modules, {})
         target = device_for(config.field, device)
+        if has_changed(folder, scene.manifest):
+            say(f"{folder}: its scene {config.scene} was changed, {CHANGED}; train again")
         return Run(
             folder=folder,
             config=config,
@@ -114,7 +126,8 @@ def open_folder(config: TrainConfig) -> None:
                 "choose another --out, or delete it to start over"
             )
         refuse_another_scene(config, places)
-    elif any((out / "checkpoints").glob("step_*.safetensors")):
+        refuse_changed_scene(config)
+    elif checkpoint_files(out):
         raise InputError(
             f"{out}: holds checkpoints but no {CONFIG}; "
             "choose another --out, or delete it to start over"
@@ -143,6 +156,33 @@ def refuse_another_scene(config: TrainConfig, places: Sequence[Path]) -> None:
             f"{config.out}: holds a run on another scene, {known[0].parent}; "
             "choose another --out, or delete it to start over"
         )
+
+
+def refuse_changed_scene(config: TrainConfig) -> None:
+    """InputError where a run is to go on and `prepare` has changed its scene."""
+    if (config.scene / SCENE_FILE).is_file() and has_changed(
+        config.out, Manifest.load(config.scene)
+    ):
+        raise InputError(
+            f"{config.out}: holds a run on {config.scene} before that was changed, {CHANGED}; "
+            "choose another --out, or delete it to start over"
+        )
+
+
+def has_changed(folder: Path, scene: Manifest) -> bool:
+    """Whether the scene of a run is not what it was trained on, as far as is known."""
+    before, now = stored_key(folder), training_key(scene)
+    return None not in (before, now) and before != now
+
+
+def stored_key(folder: Path) -> str | None:
+    """`training_key` of the scene that a run was begun on; None where it is unknown, or
+    nothing is learned yet.
+    """
+    path = Path(folder) / CONFIG
+    data = read_json(path) if path.is_file() and checkpoint_files(folder) else None
+    key = data.get(SCENE_KEY) if isinstance(data, dict) else None
+    return key if isinstance(key, str) else None
 
 
 def read_config(folder: Path) -> TrainConfig:
@@ -176,6 +216,8 @@ def stored_config(folder: Path) -> tuple[TrainConfig, list[Path]]:
             f"{path}: not readable JSON; restore it or train again into a new folder"
         ) from error
     beside = data.pop(SCENE_FROM_RUN, None) if isinstance(data, dict) else None
+    if isinstance(data, dict):
+        data.pop(SCENE_KEY, None)
     if isinstance(data, dict) and "scene" not in data and "version" in data:
         advice = 'add "scene": "FOLDER", the scene folder that it was trained on'
         raise InputError(f"{path}: no scene is named; {advice}")
@@ -202,8 +244,14 @@ def no_run(folder: Path) -> str:
 
 
 def write_config(folder: Path, config: TrainConfig) -> None:
-    """Save the config of a run, and where its scene is as seen from there."""
+    """Save the config of a run, where its scene is as seen from there, and what it was
+    when the run began.
+    """
     data = config.to_json()
+    known = stored_key(folder)
+    if known is None and (config.scene / SCENE_FILE).is_file():
+        known = training_key(Manifest.load(config.scene))
+    data[SCENE_KEY] = known
     try:
         data[SCENE_FROM_RUN] = os.path.relpath(config.scene, folder.resolve())
     except ValueError:  # another drive of Windows
