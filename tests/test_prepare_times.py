@@ -161,6 +161,17 @@ def test_cameras_of_a_rig_take_turns_across_a_gap(tmp_path: Path) -> None:
     assert work.manifest.places == (KEPT % 5).tolist()
 
 
+@pytest.mark.parametrize(("hold_out", "cameras"), [(None, 3), (8, 1), (0, 0)])
+def test_the_default_holds_out_frames_of_all_cameras_of_a_rig_in_turn(
+    hold_out: int | None, cameras: int, tmp_path: Path
+) -> None:
+    work = stamped(tmp_path, {"": np.arange(27)}, rig=8, hold_out=hold_out)
+    exposure_step(work)
+    places = work.manifest.places
+    split = zip(places, work.manifest.frames, strict=True)
+    assert len({place for place, f in split if f.split == "test"}) == cameras
+
+
 def test_a_camera_of_a_rig_whose_frames_are_all_missing_is_named(tmp_path: Path) -> None:
     work = stamped(tmp_path, {"": np.delete(np.arange(27), [3, 12, 21])}, rig=9)
     with pytest.raises(InputError, match=r"--rig 9: of camera 3, .* all frames are missing"):

@@ -218,6 +218,11 @@ def exposure_step(work: Work) -> StepResult:
         frame.split = "test" if frame.index in held_out else "train"
     work.forget(("equalized",))
     m.rig = cameras_in_turn(work)
+    if m.rig > 1:
+        held_out = frames_to_hold_out(work, m.rig)
+        for frame in m.frames:
+            frame.split = "test" if frame.index in held_out else "train"
+        work.forget(("equalized",))
     check_lens_in_turn(work.config, m.rig)
     if m.rig == 1:
         check_cuts(work)
@@ -329,9 +334,12 @@ def check_cuts(work: Work) -> None:
 # Frames to hold out
 
 
-def frames_to_hold_out(work: Work) -> set[int]:
-    """Indices of the frames to hold out of training, chosen camera by camera."""
+def frames_to_hold_out(work: Work, rig: int = 1) -> set[int]:
+    """Indices of the frames to hold out of training, chosen camera by camera. Of a
+    `rig` whose cameras take turns, the default takes frames of all in turn.
+    """
     cycle = work.manifest.cycle
+    turns = rig if work.config.hold_out is None else 1
     chosen: set[int] = set()
     for frames in work.camera_frames():
         match work.config.protocol:
@@ -340,7 +348,7 @@ def frames_to_hold_out(work: Work) -> set[int]:
             case "novel-view-time":
                 numbers = frames_between(len(frames), cycle)
             case None:
-                numbers = hold_out_every(len(frames), hold_out_spacing(work), cycle)
+                numbers = hold_out_every(len(frames), hold_out_spacing(work), cycle * turns)
         chosen.update(frames[k] for k in numbers)
     return chosen
 
