@@ -14,7 +14,7 @@ from hdr_nsff.prepare.work import PrepareConfig, StepName, Work
 from hdr_nsff.scene.scene import Scene
 
 
-def stop_at(step: StepName, config: PrepareConfig, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
+def stop_at(step: StepName, settings: PrepareConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     """`prepare`, until a step has begun."""
 
     def stopped(work: Work) -> None:
@@ -24,7 +24,7 @@ def stop_at(step: StepName, config: PrepareConfig, monkeypatch: pytest.MonkeyPat
     with monkeypatch.context() as patch:
         patch.setattr(prepare_module, "STEPS", steps)
         with pytest.raises(KeyboardInterrupt):
-            prepare(config)
+            prepare(settings)
 
 
 @pytest.mark.parametrize("step", ["movers", "depth"])
