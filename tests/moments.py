@@ -5,16 +5,19 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from test_splat import TIMES, batch_of, scattered
+from test_splat import batch_of, scattered
 from torch import Tensor
 
 from hdr_nsff.fields.splat import training_view
 from hdr_nsff.fields.splat.config import SplatConfig
+from hdr_nsff.fields.splat.rasterize import rotation_matrices
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.fields.splat.training_view import CloudMaker
+from hdr_nsff.geometry.cameras import Camera
 
 NAMES = ("means", "quaternions", "scales", "opacities", "features")
 ROUNDING = 2e-5  # of the largest number: plain torch computes in float32
+FRAMES = torch.tensor([0.0, 1, 2, 4, 5, 6, 7, 8, 9, 10])  # a frame is held out
 SETTINGS: list[dict[str, Any]] = [
     {"local": 0},
     {"moving": 0, "local": 0},
@@ -33,17 +36,24 @@ MOMENTS: list[tuple[int, dict[str, Any], float, int | None]] = [
 ]
 
 
+def oblique(focal: tuple[float, float], turn: list[float], center: list[float]) -> Camera:
+    """A camera of 40 x 30 pixels, none of whose numbers is that of another axis."""
+    K = torch.tensor([[focal[0], 0, 18.0], [0, focal[1], 16.0], [0, 0, 1]])
+    rotation = rotation_matrices(torch.tensor([turn]))[0]
+    return Camera(K, torch.cat([rotation, torch.tensor(center)[:, None]], 1), 40, 30)
+
+
+HERE = oblique((60.0, 50.0), [1.0, 0.05, -0.1, 0.2], [0.1, 0.05, -0.1])
+THERE = oblique((64.0, 56.0), [1.0, -0.1, 0.05, 0.1], [0.2, -0.1, 0.05])
+
+
 def random_field(seed: int = 0, **settings: Any) -> Splat:
     """Random Gaussians, some of them with dark, long or steep numbers."""
-    field = scattered(seed)
-    if settings:
-        config = replace(field.config, **settings)
-        other = Splat(config, torch.arange(TIMES), 1.0, 6.0, 1200)
-        other.load_state_dict(
-            {k: v for k, v in field.state_dict().items() if v.shape == other.state_dict()[k].shape},
-            strict=False,
-        )
-        field = other
+    given = scattered(seed)
+    field = Splat(replace(given.config, **settings), FRAMES, 1.0, 6.0, 1200)
+    shapes = {k: v.shape for k, v in field.state_dict().items() if k != "times"}
+    same = {k: v for k, v in given.state_dict().items() if v.shape == shapes.get(k)}
+    field.load_state_dict(same, strict=False)
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         field.static.opacity_logits[::5] = -9.0
@@ -61,7 +71,7 @@ def values_and_gradients(
     kernels or by plain torch.
     """
     offsets = [] if offset is None else [offset]
-    batch = batch_of(0, offset or 1)
+    batch = replace(batch_of(0, offset or 1), camera=HERE, neighbors={offset or 1: THERE})
     view = training_view.TrainingView(batch, knot, field.alive(knot), offsets, rigidity)
     if make_cloud is None:
         made, _, terms = training_view.draw_by_torch(field.model(), view)
@@ -78,7 +88,13 @@ def values_and_gradients(
     for name, buffer in field.named_buffers():
         if name.endswith("touched"):
             buffer.zero_()
-    return {k: v.detach() for k, v in values.items()}, {**found, **marks}
+    features = values.pop("features")
+    kinds = {
+        "log radiance": features[:, :3].log(),
+        "motion": features[:, 3],
+        "flow": features[:, 4:],
+    }
+    return {k: v.detach() for k, v in (values | kinds).items()}, {**found, **marks}
 
 
 def compare(make_cloud: CloudMaker, field: Splat, knot: float, offset: int | None) -> None:

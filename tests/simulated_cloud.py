@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 import torch
-from moments import MOMENTS, compare, field_of_times, random_field
+from moments import MOMENTS, THERE, compare, field_of_times, random_field
 from pictures import compare_composites
-from test_splat import BESIDE, TIMES, scattered
+from test_splat import TIMES, scattered
 from torch import Tensor
 
 from hdr_nsff.fields.base import Render
@@ -69,7 +69,7 @@ def test_flow_is_limited_near_the_camera() -> None:
     with torch.no_grad():
         field.static.means[:5, 2] = 1e-5
         field.static.means[5:8, 2] = -1.0
-    assert float(BESIDE.project(field.static.means.detach())[0].abs().max()) > 100
+    assert float(THERE.project(field.static.means.detach())[0].abs().max()) > 100
     compare(fused_cloud, field, 4.0, 1)
 
 
