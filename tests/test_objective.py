@@ -13,10 +13,11 @@ from torch import Tensor
 
 from hdr_nsff.fields.base import Render, Warp
 from hdr_nsff.fields.nsff.nsff import SceneFlowLosses
-from hdr_nsff.scene.batch import PixelBatch, draw_pixels
+from hdr_nsff.scene.batch import PixelBatch, draw_pixels, whole_frame
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.base import ToneMapConfig, ToneMapLosses, ToneMapper
 from hdr_nsff.tonemap.build import tone_mapper_for
+from hdr_nsff.training import objective
 from hdr_nsff.training.objective import LossWeights, Objective
 from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.weighted_terms import backward, merge_weights, weighted_sum
@@ -126,6 +127,30 @@ def test_depth_and_flow_fade_by_a_tenth_every_phase(batch: PixelBatch, tonemap: 
     for name in ("depth", "flow"):
         for phase, share in ((0.99, 1.0), (1.0, 0.1), (2.5, 0.01)):
             assert math.isclose(float(at[phase][name]), share * float(at[0.0][name]), rel_tol=1e-5)
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.9, 2.5])
+def test_whole_frames_have_the_same_terms_by_kernels(
+    phase: float, toy: Scene, tonemap: ToneMapper, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = whole_frame(toy, 3)
+    exact = perfect(whole)
+    flow = exact.warps[1].flow.clone()
+    flow[:, 0] += torch.linspace(0, 40, len(flow))  # beyond the limit at the end
+    render = replace(
+        exact,
+        radiance=exact.radiance * 0.8,
+        depth=exact.depth * 1.2,
+        motion=0.9 * exact.motion + 0.03,
+        scene_flow={},
+        warps=(replace(exact.warps[1], flow=flow, radiance=None),),
+    )
+    found = OBJECTIVE.terms(render, whole, tonemap, phase)
+    monkeypatch.setattr(objective, "losses_by_kernels", lambda rgb: None)
+    expected = OBJECTIVE.terms(render, whole, tonemap, phase)
+    assert set(found) == {"photometric", "depth", "mask", "flow"}
+    assert min(float(term) for term in expected.values()) > 1e-4
+    torch.testing.assert_close(found, expected)
 
 
 def test_relative_depth_ignores_the_scale_of_the_prior(
