@@ -17,7 +17,7 @@ from torch import Tensor
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import write_exr
-from hdr_nsff.core.images import read_image, write_png
+from hdr_nsff.core.images import read_image, read_mask, write_png
 from hdr_nsff.core.io import write_json
 from hdr_nsff.evaluation.evaluate import EvaluateConfig, evaluate, evaluate_run
 from hdr_nsff.fields.base import Render
@@ -147,6 +147,12 @@ def test_moving_only_numbers_see_the_mover_alone(tmp_path: Path) -> None:
     assert view["psnr_moving"] < view["psnr"] - 5
     error = 0.75 ** (1 / 2.2) - 0.375 ** (1 / 2.2)  # red at EV -2, one channel of three
     assert view["psnr_moving"] == pytest.approx(-10 * np.log10(error**2 / 3), abs=0.1)
+    # the wall has no error: means over it and the disc differ by the disc's share
+    share = -10 * np.log10(read_mask(tmp_path / "truth/masks/a.png").mean())
+    for name in ("pu21", "mu5000", "mu50_per_channel", "mu50_unaligned"):
+        assert view[name] - view[f"{name}_moving"] == pytest.approx(share, abs=0.05), name
+    assert view["hdr_flip_moving"] > 3 * view["hdr_flip"] > 0
+    assert view["mu50_recordable"] > 55  # the disc has black channels
 
 
 def test_held_out_frames_are_used_without_truth(tmp_path: Path) -> None:
@@ -252,6 +258,8 @@ def test_pose_errors_are_in_true_units(tmp_path: Path) -> None:
     estimated[:, :, 3] = 2 * poses[:, :, 3] + noise
     errors = alignment.pose_errors(poses, estimated)
     assert errors["ate"] == pytest.approx(0.01 * 3**0.5, rel=0.2)
+    extent = np.linalg.norm(np.ptp(poses[:, :, 3], axis=0))
+    assert errors["ate_share"] == pytest.approx(errors["ate"] / extent)
     assert errors["rotation_degrees"] < 1e-5
 
 

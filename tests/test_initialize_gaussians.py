@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from estimates import with_movers
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 from toy_scene import CARD, EV, WALL, ToyScene, card_offset
 
@@ -21,11 +22,14 @@ from hdr_nsff.fields.splat.initialize_gaussians import (
     neighbor_distance,
     place,
     quaternions,
+    share_bases,
     spread_centers,
     surely_moving,
 )
+from hdr_nsff.fields.splat.rasterize import rotation_matrices
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.fields.splat.terms import MIN_OPACITY
+from hdr_nsff.scene.movers import Mover
 from hdr_nsff.scene.scene import Frame, Scene, outline
 
 pytestmark = pytest.mark.filterwarnings("error")
@@ -311,6 +315,33 @@ def test_bases_spread_over_separate_heaps(count: int) -> None:
 def test_bases_of_hardly_any_points_are_finite(points: Tensor) -> None:
     places = spread_centers(points, 4, torch.tensor([1.0, 2, 3]))
     assert places.shape == (4, 3) and torch.isfinite(places).all()
+
+
+def test_shared_motions_move_and_turn_as_their_mover_does() -> None:
+    rng, count = np.random.default_rng(0), 6
+    places = torch.from_numpy(rng.random((20, 3))).float()
+    turns = Rotation.from_rotvec(np.outer(0.3 * np.arange(count), [0.3, 1.0, -0.5])).as_matrix()
+    mover = Mover(
+        frames=np.arange(count),
+        pixels=np.zeros((0, count, 2)),
+        trust=np.zeros((0, count)),
+        points=np.zeros((0, 3)),
+        rotations=turns,
+        translations=rng.normal(size=(count, 3)),
+        center=np.array([0.2, 0.5, 2.0]),
+        known=np.ones(count, bool),
+        error=0.1,
+    )
+    field = Splat(SplatConfig(static=0, moving=20, bases=3), torch.arange(count), 1.0, 6.0, 1200)
+    with torch.no_grad():
+        field.moving.means[:] = places
+        share_bases(field, [mover], places, torch.zeros(20, dtype=torch.long))
+        for t in range(count):
+            cloud = field.cloud(float(t))
+            expected = torch.from_numpy(mover.world(places.double().numpy(), t)).float()
+            torch.testing.assert_close(cloud.means, expected, atol=1e-4, rtol=1e-4)
+            turned = rotation_matrices(cloud.quaternions)
+            torch.testing.assert_close(turned, torch.from_numpy(turns[t]).float().expand(20, 3, 3))
 
 
 def test_quaternions_do_not_jump() -> None:

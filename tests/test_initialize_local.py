@@ -162,6 +162,18 @@ def test_velocities_need_no_believed_flow(soft: Scene) -> None:
     test_velocities_are_those_of_the_card(field)
 
 
+def test_velocities_are_per_frame_also_where_frames_are_missing(soft: Scene) -> None:
+    """Every second frame is held out: the card takes two frames for a step."""
+    scene = replace(soft, train=[replace(f, time=2 * f.time) for f in soft.train])
+    local = Splat(SplatConfig(static=400, moving=0, local=600), scene.times, 1.0, 6.0, 2040).local
+    with torch.no_grad():
+        place_local(local, scene, recorded, scene.near)
+        own = (local.means[:, 3] == 6) & (local.colors[:, 3] > 0)
+        median = local.velocities[own, :2].median(0).values
+    step = torch.from_numpy(card_offset(4.0) - card_offset(2.0)).float() / 2
+    torch.testing.assert_close(median, step / 2, atol=0.005, rtol=0.1)
+
+
 def test_fast_lives_are_short_but_bridge_a_missing_frame(soft: Scene) -> None:
     f = soft.train[2]
     on_axis = f.camera.c2w[:, 3] + 2 * f.camera.c2w[:, 2]

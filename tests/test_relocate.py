@@ -118,6 +118,18 @@ def test_a_half_lies_beside_the_other_and_is_narrower() -> None:
     torch.testing.assert_close(g.means.detach()[[0, 1, 2, 3, 5, 6, 8, 9]], others)
 
 
+def test_a_turned_gaussian_is_cut_across_its_own_longest_axis() -> None:
+    g, scores = scattered().static, torch.tensor([[0.0, 1.0]] * 40)
+    scores[4, 0], scores[7, 1] = 3.0, 0.0
+    g.quaternions.data[4] = torch.tensor([math.cos(0.25), 0, 0, math.sin(0.25)])
+    g.log_scales.data[4] = torch.tensor([-2.0, -1.0, -3.0])  # along y, turned by 0.5 about z
+    mean = g.means[4].detach().clone()
+    assert relocate(g, scores, [], torch.Generator().manual_seed(0)) == 1
+    length = HALF_OFFSET * math.exp(-1.0)
+    along = length * torch.tensor([-math.sin(0.5), math.cos(0.5), 0.0])
+    torch.testing.assert_close(g.means[[4, 7]].detach(), torch.stack([mean - along, mean + along]))
+
+
 def test_without_error_nothing_moves() -> None:
     field = scattered()
     before = [p.detach().clone() for p in field.parameters()]

@@ -62,6 +62,15 @@ def test_a_pixel_takes_the_depth_of_near_tracks_unless_it_differs_much() -> None
     assert disparity[2, 2] == np.float32(0.4)  # what was given stays as it was
 
 
+def test_depth_is_that_along_the_axis_of_a_turned_camera() -> None:
+    turn = Rotation.from_rotvec([0.2, 0.6, -0.3]).as_matrix()
+    c2w = np.c_[turn, [1.0, 2.0, 3.0]]
+    tracks = mover([[2.5, 2.5]], [c2w[:, 3] + turn @ [0.4, -0.3, 2.2]])
+    flat, moving = np.full((4, 6), 0.4, np.float32), np.ones((4, 6), bool)
+    found, _ = fill_mover_depth([tracks], 0, moving, c2w, flat, np.zeros_like(flat))
+    assert found[2, 2] == pytest.approx(1 / 2.2)
+
+
 def test_two_movers_do_not_mix_their_depths() -> None:
     disparity, confidence = np.full((4, 8), 0.4, np.float32), np.zeros((4, 8), np.float32)
     movers = [mover([[1.5, 1.5]], [[0, 0, 2.0]]), mover([[6.5, 1.5]], [[0, 0, 3.0]])]
