@@ -3,8 +3,11 @@
 Video, depth and flow of a clip are computed from its poses.
 """
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from hdr_nsff.scene.posed_video import PosedVideo
 
@@ -20,6 +23,15 @@ def cameras_at(*eyes: tuple[float, float, float]) -> np.ndarray:
 
 
 SWEEPING = cameras_at(*[(0.16 * (t - 3), 0.06 * np.sin(t), 0) for t in range(7)])
+
+
+def oblique(count: int) -> PosedVideo:
+    """Gray frames of cameras of unlike focal lengths, turned each in its own way."""
+    rng = np.random.default_rng(0)
+    turns = Rotation.from_rotvec(0.08 * rng.normal(size=(count, 3))).as_matrix()
+    c2w = np.concatenate([turns, 0.15 * rng.normal(size=(count, 3, 1))], 2)
+    own_K = K + np.array([[4.0, 0, -3], [0, -6, 2], [0, 0, 0]]) * rng.random((count, 1, 1))
+    return replace(posed_video(c2w), K=own_K)
 
 
 def texture(seed: int = 0) -> np.ndarray:

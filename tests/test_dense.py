@@ -2,8 +2,9 @@
 
 import cv2
 import numpy as np
+import pytest
 
-from hdr_nsff.priors.flow.dense import average_with_reverse, dense_flow
+from hdr_nsff.priors.flow.dense import DenseFlowTuning, average_with_reverse, dense_flow
 
 H, W = 64, 96
 NONE_CLIPPED = np.zeros((2, H, W), bool)
@@ -22,8 +23,10 @@ def sliding(dx: float, dy: float) -> np.ndarray:
     return np.stack([cv2.warpAffine(texture(), m, (W, H), flags=cv2.INTER_CUBIC) for m in shifts])
 
 
-def test_a_sliding_plane_gives_its_motion_everywhere():
-    found, valid = dense_flow(sliding(2.5, -1.25), NONE_CLIPPED, np.array([[0, 1]]))
+@pytest.mark.parametrize("doubled", [True, False])  # as small and as large frames are
+def test_a_sliding_plane_gives_its_motion_everywhere(doubled):
+    tuning = DenseFlowTuning(doubled_below_pixels=H * W + doubled)
+    found, valid = dense_flow(sliding(2.5, -1.25), NONE_CLIPPED, np.array([[0, 1]]), tuning)
     inner = found[0, 8:-8, 8:-8]
     assert np.abs(inner - [2.5, -1.25]).max() < 0.15
     assert valid[0, 8:-8, 8:-8].mean() > 0.99

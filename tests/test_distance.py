@@ -2,6 +2,7 @@
 
 import numpy as np
 from posed_planes import F, H, W, X, Y, cameras_at, neighbors, posed_video
+from scipy.spatial.transform import Rotation
 
 from hdr_nsff.priors.movers.distance import mover_depth, smoothest_path
 from hdr_nsff.priors.movers.regions import FlowStep, region_growth
@@ -78,8 +79,10 @@ def test_growth_is_read_from_flow_whose_limbs_move_otherwise() -> None:
     assert region_growth(FlowStep(0, 1, flows, ~valid, 0, 1), region, region) is None
 
 
-def test_a_drifting_object_seen_by_a_shaking_camera_gets_its_own_depth() -> None:
-    """A square at z = 2 before a wall at z = 4, moving by 0.03 per frame."""
+def drifting_square(turn: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mask, disparity and confidence (T, H, W) of a square at z = 2 before a wall at
+    z = 4, moving by 0.03 per frame; the world is turned (3, 3).
+    """
     rng = np.random.default_rng(3)
     eyes = np.concatenate([0.03 * rng.standard_normal((20, 2)), np.zeros((20, 1))], 1)
     place = np.stack([0.03 * np.arange(20) - 0.3, np.zeros(20)], -1)
@@ -89,8 +92,18 @@ def test_a_drifting_object_seen_by_a_shaking_camera_gets_its_own_depth() -> None
     motions = [np.broadcast_to(center[j] - center[i], (H, W, 2)) for i, j in pairs]
     flow = np.stack(motions).astype(np.float32)
     wall = np.full((20, H, W), 0.25, np.float32)
-    clip, valid = posed_video(cameras_at(*eyes), moving), np.ones(flow.shape[:3], bool)
-    disparity, confidence = map(np.asarray, mover_depth(clip, flow, valid, pairs, wall))
+    clip, valid = posed_video(turn @ cameras_at(*eyes), moving), np.ones(flow.shape[:3], bool)
+    return moving, *map(np.asarray, mover_depth(clip, flow, valid, pairs, wall))
+
+
+def test_a_drifting_object_seen_by_a_shaking_camera_gets_its_own_depth() -> None:
+    moving, disparity, confidence = drifting_square(np.eye(3))
     assert np.abs(disparity[moving] * 2 - 1).mean() < 0.03
     assert (disparity[~moving] == 0.25).all()
     assert confidence[~moving].max() == 0 and 0.4 < confidence[moving].mean() <= 0.5
+
+
+def test_the_axes_of_the_world_are_of_no_matter() -> None:
+    turn = Rotation.from_rotvec([0.5, -1.0, 0.8]).as_matrix()
+    for found, expected in zip(drifting_square(turn), drifting_square(np.eye(3)), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-4)

@@ -145,6 +145,16 @@ def test_frames_of_two_exposures_become_one_picture(measured: Response) -> None:
     assert unclipped.sum() > 100 and np.abs(one - other)[unclipped].mean() < 0.02
 
 
+def test_frames_that_drift_are_brought_to_their_brackets(measured: Response) -> None:
+    gains = 0.0, 0.8  # stops
+    views = [wall_view(1, S_CURVE, np.random.default_rng(1), gain=2**g) for g in gains]
+    video, nothing = np.stack([v.image for v in views]), np.zeros(2, int)
+    one, other = at_one_exposure(video, nothing + 1, nothing, measured, np.array(gains))
+    unclipped = ((video > 0.1) & (video < 0.9)).all((0, -1)) & ~views[0].moving
+    assert np.abs(video[0] - video[1])[unclipped].mean() > 0.1
+    assert unclipped.sum() > 100 and np.abs(one - other)[unclipped].mean() < 0.02
+
+
 def test_it_is_read_as_it_was_written(measured: Response, tmp_path) -> None:
     write_response(tmp_path / "response.json", measured)
     found = read_response(tmp_path / "response.json", num_cameras=1, num_brackets=3)

@@ -1,8 +1,9 @@
 """Fusion of disparity maps: warped maps, their vote, and edges on image edges."""
 
 import numpy as np
-from posed_planes import H, W, cameras_at, posed_video
+from posed_planes import H, W, cameras_at, oblique, posed_video
 
+from hdr_nsff.geometry.pinhole import pixel_centers
 from hdr_nsff.priors.depth.fuse import FuseTuning, joint_median, vote, warp_disparity
 
 TUNING = FuseTuning()
@@ -21,6 +22,23 @@ def test_a_warped_map_shifts_by_its_parallax_and_the_nearer_surface_wins():
     warp_disparity(disparity, weight, rotation, shift, result, result_weight)
     assert np.isclose(result[10, 20], 0.1) and result_weight[10, 20] == 0.5
     assert (result > 0).sum() == 1
+
+
+def test_a_map_lands_where_a_turned_camera_sees_its_points_at_their_depth_there():
+    clip, rng = oblique(2), np.random.default_rng(1)
+    disparity = rng.uniform(0.2, 0.4, (H, W)).astype(np.float32)
+    weight = (rng.random((H, W)) < 0.1).astype(np.float32)
+    pixels = pixel_centers(H, W)[weight > 0]
+    world = clip.unproject(0, pixels, disparity[weight > 0].astype(float))
+    seen, depth, inside = clip.project(1, world)
+    expected = np.zeros((H, W))
+    for (x, y), z in zip(seen[inside].astype(int), depth[inside], strict=True):
+        expected[y, x] = max(expected[y, x], 1 / z)
+    result, result_weight = np.empty_like(disparity), np.empty_like(disparity)
+    warp_disparity(disparity, weight, *clip.transfer(0, 1), result, result_weight)
+    assert 200 < (expected > 0).sum() < len(pixels)
+    np.testing.assert_allclose(result, expected, atol=1e-5)
+    np.testing.assert_array_equal(result_weight > 0, expected > 0)
 
 
 def test_the_vote_is_the_mean_of_those_near_the_weighted_median():

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from posed_clips import BOARDS, H, K, W, sliding
+from posed_planes import oblique
 
 from hdr_nsff.core.images import write_png
 from hdr_nsff.core.io import read_npy
@@ -94,6 +95,14 @@ def test_a_pixel_is_as_far_from_the_line_as_it_was_moved():
     across = along[:, ::-1] * (1, -1)
     moved = np.concatenate([q + 2 * across, q + 5 * along])
     assert line_distances(clip, 0, 1, p, moved)[0] == pytest.approx([2, 0], abs=1e-9)
+
+
+def test_what_turned_cameras_see_is_on_its_line_and_on_no_other():
+    clip, rng = oblique(2), np.random.default_rng(1)
+    points = clip.unproject(0, rng.uniform(5, 40, (9, 2)), rng.uniform(0.2, 0.5, 9))
+    p, q = (clip.project(i, points)[0] for i in (0, 1))
+    distances = line_distances(clip, 0, 1, p, q)
+    assert np.diag(distances).max() < 1e-3 < 1 < np.median(distances)
 
 
 def test_still_cameras_with_given_poses_have_depth_and_whole_masks(tmp_path):

@@ -2,10 +2,16 @@
 another way.
 """
 
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
 import cv2
 import numpy as np
 import pytest
 
+from hdr_nsff.core.io import write_npy
+from hdr_nsff.prepare.steps.refined_flow import Refiner
 from hdr_nsff.priors.flow.masked_least_squares import (
     MASKED_LEAST_SQUARES_TUNING,
     refine_mover_flow,
@@ -109,3 +115,26 @@ def test_flow_far_from_the_truth_changes_by_the_largest_steps_at_most() -> None:
     change = refine_mover_flow(*frames(), start, MASK) - start
     tuning = MASKED_LEAST_SQUARES_TUNING
     assert np.abs(change).max() < tuning.iterations * tuning.max_step_px + 1e-3
+
+
+def test_both_directions_of_a_pair_are_refined_each_in_its_own_mask(tmp_path: Path) -> None:
+    video, moving = np.stack(frames()), np.stack([MASK, disc(DISC)])
+    truths = [
+        np.where(m[..., None], s * DISC, s * WALL) for m, s in zip(moving, (1, -1), strict=True)
+    ]
+    starts = [cv2.GaussianBlur(truth.astype(np.float32), (0, 0), 3.0) for truth in truths]
+    entries = []
+    for k, start in enumerate(starts):
+        write_npy(tmp_path / f"{k}.npy", start)
+        entries.append(SimpleNamespace(raw_flow={1 - k: SimpleNamespace(flow=f"{k}.npy")}))
+    work = SimpleNamespace(
+        folder=tmp_path,
+        manifest=SimpleNamespace(frames=entries),
+        masks=moving,
+        equalized=(video, np.zeros(moving.shape, bool)),
+    )
+    found = Refiner(cast(Any, work), video).predict_both_directions(0, 1)
+    assert [pair for pair, *_ in found] == [(0, 1), (1, 0)]
+    for (_, flow, valid), start, truth, mask in zip(found, starts, truths, moving, strict=True):
+        before, after = (np.linalg.norm(f - truth, axis=-1)[mask].mean() for f in (start, flow))
+        assert after < 0.5 * before and valid[mask].mean() > 0.5

@@ -143,3 +143,8 @@ def test_the_background_of_a_turning_camera_is_aligned():
     video[5][BODY] = 0.05
     filled = correct_by_background(moving, video, ONE_GROUP, ALL, K, c2w)
     assert filled[5][HOLE].mean() > 0.9 and filled.sum() <= 24 * 14 + 80
+    # frames twice as large are compared on the same grid
+    tuning, twice = BackgroundTuning(working_pixels=H * W), np.array([[2.0], [2], [1]])
+    large, larger = (images.repeat(2, 1).repeat(2, 2) for images in (video, moving))
+    found = correct_by_background(larger, large, ONE_GROUP, ALL, twice * K, c2w, tuning)
+    assert np.array_equal(found, filled.repeat(2, 1).repeat(2, 2))

@@ -4,12 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from painted_clips import H, K, W, cameras, painted_clip
+from painted_clips import H, K, T, W, cameras, painted_clip
+from scipy.spatial.transform import Rotation
 
+from hdr_nsff.geometry import pinhole
 from hdr_nsff.priors.masks import geometric
 from hdr_nsff.priors.masks.geometric import geometric_mask, rough_mask, texture_confidence
 from hdr_nsff.priors.masks.geometric_tuning import GEOMETRIC_MASK_TUNING
-from hdr_nsff.priors.masks.static_residuals import working_clip
+from hdr_nsff.priors.masks.static_residuals import chain_flow, working_clip
 
 
 def iou(a: np.ndarray, b: np.ndarray) -> float:
@@ -70,6 +72,27 @@ def test_large_frames_are_judged_on_a_coarser_grid():
     found = geometric_mask(*given, K, cameras(), tuning)
     assert found.shape == truth.shape
     assert iou(found, truth) > 0.6
+
+
+def test_the_cameras_of_a_coarser_grid_explain_a_static_scene(monkeypatch):
+    """A wall before cameras that turn: its flow on the grid has no residuals."""
+    turns = Rotation.from_rotvec(0.03 * np.random.default_rng(0).normal(size=(T, 3))).as_matrix()
+    c2w = np.concatenate([turns, cameras()[:, :, 3:]], 2)
+    pairs = np.array([(i, j) for i in range(T) for j in (i - 1, i + 1) if 0 <= j < T])
+    flow = []
+    for i, j in pairs:
+        rays = pinhole.world_rays(pinhole.pixel_centers(H, W), K, c2w[i])
+        wall = c2w[i, :, 3] + rays * (4 / rays[..., 2:])  # at z = 4
+        flow.append(pinhole.project(wall, K, c2w[j])[0] - pinhole.pixel_centers(H, W))
+    valid, video = np.ones((len(pairs), H, W), bool), np.zeros((T, H, W, 3), np.float32)
+    seen = []
+    monkeypatch.setattr(geometric, "segment_motion", lambda *given: seen.extend(given))
+    tuning = replace(GEOMETRIC_MASK_TUNING, working_pixels=H * W // 4, reach_frames=1)
+    geometric_mask(np.array(flow), valid, pairs, video, K, c2w, tuning)
+    clip, residuals, *_ = seen
+    assert clip.coarseness == 2
+    residual = residuals(3, chain_flow(clip, 3, tuning))
+    assert residual.shape == (2, H // 2, W // 2, 2) and np.abs(residual).max() < 0.02
 
 
 def test_the_coarser_grid_of_an_odd_size_shifts_nothing(monkeypatch):

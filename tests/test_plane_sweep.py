@@ -1,12 +1,16 @@
 """The parts of the plane sweep: window means, the best views, and smoothness."""
 
 import numpy as np
+from posed_planes import H, W, oblique
 
+from hdr_nsff.geometry.pinhole import pixel_centers
 from hdr_nsff.priors.depth.plane_sweep import (
+    OUTSIDE,
     PlaneSweepTuning,
     aggregate,
     box,
     mean_of_lowest,
+    warp,
 )
 
 TUNING = PlaneSweepTuning()
@@ -17,6 +21,20 @@ def test_box_is_the_mean_over_the_window_inside_the_image():
     box(image, 1, result)
     assert np.isclose(result[0, 0], (0 + 1 + 4 + 5) / 4)
     assert np.isclose(result[1, 1], 5)
+
+
+def test_a_frame_is_read_where_a_turned_camera_sees_the_pixels():
+    """Its gray values grow evenly, so that they are exact between pixels."""
+    clip, centers = oblique(2), pixel_centers(H, W)
+    world = clip.unproject(0, centers.reshape(-1, 2), np.full(H * W, 0.25))
+    seen = clip.project(1, world)[0].reshape(H, W, 2)
+    inside = ((seen >= 0.5) & (seen <= [W - 0.5, H - 0.5])).all(-1)
+    assert 0.5 < inside.mean() < 0.95
+    gray, marks = (centers @ [1.0, 3.0]).astype(np.float32), np.zeros((H, W), np.uint8)
+    warped, met = np.empty_like(gray), np.empty_like(marks)
+    warp(gray, marks, *clip.transfer(0, 1), np.float32(0.25), warped, met)
+    np.testing.assert_array_equal(met, np.where(inside, 0, OUTSIDE))
+    np.testing.assert_allclose(warped[inside], (seen @ [1.0, 3.0])[inside], atol=0.01)
 
 
 def test_only_the_best_three_quarters_of_the_views_count():

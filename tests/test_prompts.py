@@ -16,7 +16,9 @@ def test_two_discs_are_two_objects_the_larger_first_each_in_its_clearest_frame()
 
 def test_points_on_an_object_lie_on_it_and_points_beside_it_on_nothing_that_moves():
     moving = two_discs()
-    for found in find_objects(moving):
+    objects = find_objects(moving)
+    assert len(objects) == 2
+    for found in objects:
         (prompt,) = found.prompts
         columns, rows = np.floor(prompt.points).astype(int).T
         on, beside = prompt.labels == 1, prompt.labels == 0
@@ -26,7 +28,9 @@ def test_points_on_an_object_lie_on_it_and_points_beside_it_on_nothing_that_move
 
 
 def test_the_box_encloses_its_object_tightly():
-    for found in find_objects(two_discs()):
+    objects = find_objects(two_discs())
+    assert len(objects) == 2
+    for found in objects:
         (prompt,) = found.prompts
         rows, columns = np.nonzero(found.masks[prompt.frame])
         left, top, right, bottom = prompt.box

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import pytest
 import torch
 from bad_input import Capture, refused, training
+from moments import HERE, THERE
 from test_splat import BESIDE, CAMERA, STEP, batch_of, card_field
 from torch import Tensor
 
@@ -24,6 +25,7 @@ from hdr_nsff.fields.splat.shutter import (
     row_times,
     shutter_for,
 )
+from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.scene import Scene
 
 TIME = 4
@@ -65,11 +67,12 @@ def test_no_shutter_and_a_moment_are_the_same(monkeypatch: pytest.MonkeyPatch) -
     torch.testing.assert_close(by_kernels, moment)
 
 
-def test_the_cameras_motion_counts_as_that_of_points() -> None:
+@pytest.mark.parametrize("here, there", [(CAMERA, BESIDE), (HERE, replace(THERE, K=HERE.K))])
+def test_the_cameras_motion_counts_as_that_of_points(here: Camera, there: Camera) -> None:
     points = torch.tensor([[0.0, 0, 2], [0.3, 0.1, 4]])
-    motion = apparent_motion(CAMERA, [(BESIDE, points + STEP, 5.0)], points, 4.0)
-    there = BESIDE.project(points + STEP)[0]
-    torch.testing.assert_close(CAMERA.project(points + motion)[0], there)
+    motion = apparent_motion(here, [(there, points + STEP, 5.0)], points, 4.0)
+    seen = there.project(points + STEP)[0]
+    torch.testing.assert_close(here.project(points + motion)[0], seen)
     both = [(CAMERA, points - STEP, 3.0), (CAMERA, points + STEP, 5.0)]
     torch.testing.assert_close(apparent_motion(CAMERA, both, points, 4.0), STEP.expand(2, 3))
 

@@ -2,8 +2,11 @@
 
 import numpy as np
 from painted_clips import FOCAL, SPEED, H, K, T, W, cameras, painted_clip
+from posed_planes import oblique
 
+from hdr_nsff.geometry.pinhole import pixel_centers
 from hdr_nsff.priors.masks.static_residuals import (
+    ChainedFlow,
     chain_flow,
     epipolar_residual,
     static_residual,
@@ -29,6 +32,19 @@ def test_the_static_residual_is_zero_at_rest_and_the_motion_of_movers():
     residual = static_residual(0, to_next, np.tile(K, (T, 1, 1)), cameras())[0]
     assert np.allclose(residual[~truth[0] & valid[1]], 0, atol=1e-3)
     assert np.allclose(residual[truth[0]].mean(0), (-4, 0), atol=1e-3)
+
+
+def test_points_at_rest_have_no_residual_before_turned_cameras():
+    clip = oblique(5)
+    centers = pixel_centers(*clip.size)
+    pixels = centers.reshape(-1, 2)
+    disparity = np.random.default_rng(2).uniform(0.1, 0.5, len(pixels))
+    world, everywhere = clip.unproject(2, pixels, disparity), np.ones(clip.size, bool)
+    chains = []
+    for frame, links in ((3, 1), (4, 2), (1, 1), (0, 2)):
+        seen = clip.project(frame, world)[0].reshape(centers.shape)
+        chains.append(ChainedFlow(frame, links, (seen - centers).astype(np.float32), everywhere))
+    assert np.abs(static_residual(2, chains, clip.K, clip.c2w)).max() < 1e-3
 
 
 def test_the_epipolar_residual_leads_to_the_line():
