@@ -9,6 +9,7 @@ from test_splat import CAMERA, STEP, batch_of, card_field, pixel_of
 from hdr_nsff.fields.base import RadianceField
 from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.splat import Splat
+from hdr_nsff.training.optimizers import Optimizers
 
 
 @pytest.mark.parametrize("time", [0.0, 0.3, 1.0])
@@ -37,6 +38,31 @@ def test_times_may_be_uneven() -> None:
     field.times[:] = torch.tensor([0.0, 1, 2, 3, 7, 8, 9, 10, 11, 12])
     expected = torch.lerp(field.positions(3.0), field.positions(4.0), 0.5)
     torch.testing.assert_close(field.positions(field.knot(5.0)), expected)
+
+
+def first_step(unit: float) -> dict[str, float]:
+    """By how much a first step moves every kind of number, in a scene of that unit."""
+    config = SplatConfig(static=3, moving=3, local=3, bases=1)
+    field = Splat(config, torch.arange(4), unit, 6 * unit, 1200)
+    optimizers = Optimizers(field.param_groups())
+    learned = {name: p for name, p in field.named_parameters() if p.numel()}
+    before = {name: p.detach().clone() for name, p in learned.items()}
+    for p in learned.values():
+        p.grad = torch.ones_like(p)
+    for name, marks in field.named_buffers():
+        if name.endswith("touched"):
+            marks.fill_(1)
+    optimizers.step(1.0, 0.0)
+    return {name: float((p.detach() - before[name]).abs().max()) for name, p in learned.items()}
+
+
+def test_lengths_are_learned_in_units_of_the_scene_and_nothing_else_is() -> None:
+    one, other = first_step(1.0), first_step(50.0)
+    grown = {name for name in one if other[name] > 2 * one[name]}
+    kinds = "static.means", "moving.means", "local.means", "local.velocities"
+    assert grown == {*kinds, "trajectories.translations"}
+    for name, moved in one.items():
+        assert other[name] == pytest.approx(moved * (50 if name in grown else 1), rel=1e-3), name
 
 
 def test_one_training_time_has_no_flow() -> None:

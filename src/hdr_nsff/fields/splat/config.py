@@ -98,7 +98,7 @@ class SplatConfig:
     position_lr: Advanced[Rate] = 2e-3
     """Learning rate of positions, per typical length of the scene (its near depth)."""
     pose_lr: Advanced[Rate] = 2e-3
-    """Learning rate of the shared motions."""
+    """Learning rate of the shared motions, their shifts per typical length."""
     color_lr: Advanced[Rate] = 2e-2
     """Learning rate of colors and of the mixtures of motions."""
     shape_lr: Advanced[Rate] = 2e-2

@@ -34,10 +34,9 @@ def param_groups(model: Model, config: SplatConfig) -> list[ParamGroup]:
     groups = [
         ParamGroup(params, config.lr * rate, eps=ADAM_EPS) for rate, params in by_rate.items()
     ]
-    t = model.trajectories
-    poses = ParamGroup(
-        [t.rotations, t.translations],
-        config.lr * config.pose_lr,
-        row_marks=[t.rotations_touched, t.translations_touched],
-    )
-    return [*groups, poses, *model.local.param_groups(config, model.unit)]
+    t, pose_lr = model.trajectories, config.lr * config.pose_lr
+    poses = [
+        ParamGroup([t.rotations], pose_lr, row_marks=[t.rotations_touched]),
+        ParamGroup([t.translations], pose_lr * model.unit, row_marks=[t.translations_touched]),
+    ]
+    return [*groups, *poses, *model.local.param_groups(config, model.unit)]
