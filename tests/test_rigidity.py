@@ -45,6 +45,18 @@ def test_uncertain_flow_of_the_static_scene_excuses_as_much_of_a_mover(six: Scen
     assert card.rigid and card.flow_residual > 0.5 and card.flow_uncertainty > 0.5
 
 
+def test_a_mover_whose_shape_misses_its_tracks_is_not_rigid(six: Scene) -> None:
+    clip, flow, valid, pairs = video_of(six)
+    disparity = np.stack([f.disparity.numpy() for f in six.train if f.disparity is not None])
+    (card,) = movers_of(six)
+    tuning = RIGIDITY_TUNING
+    for error, rigid in ((0.15, True), (0.45, False), (np.inf, True)):
+        (found,) = judge_rigidity(
+            [replace(card, error=error)], clip, flow, valid, pairs, disparity, tuning
+        )
+        assert found.rigid == rigid and found.flow_residual < 0.2
+
+
 def test_a_first_depth_that_was_wrong_is_not_held_against_a_mover(six: Scene) -> None:
     clip, flow, valid, pairs = video_of(six)
     disparity = np.stack([f.disparity.numpy() for f in six.train if f.disparity is not None])

@@ -4,8 +4,9 @@ cameras explain that of the static scene.
 Flow is uncertain, and so are the cameras. How far both together are off shows in the
 static scene, so the test asks for nothing that the clip cannot give: the median
 distance between flow and motion in the mover's pixels may be a small multiple of the
-same in pixels that stand still. A mover that always touches one that is not rigid is a
-part of it, as a wrist is of an arm.
+same in pixels that stand still. Flow spans one step: what deforms slowly shows in long
+tracks, which its shape has to explain too. A mover that always touches one that is not
+rigid is a part of it, as a wrist is of an arm.
 """
 
 from __future__ import annotations
@@ -70,12 +71,13 @@ def judge_rigidity(
     result = []
     for mover, own in zip(movers, residuals, strict=True):
         residual = median(own)
+        bends = mover.has_shape and mover.error > tuning.max_shape_error
         result.append(
             replace(
                 mover,
                 flow_residual=residual,
                 flow_uncertainty=uncertainty,
-                rigid=residual <= allowed,
+                rigid=residual <= allowed and not bends,
             )
         )
     soft = [mover for mover in result if not mover.rigid]

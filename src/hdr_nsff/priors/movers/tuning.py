@@ -50,6 +50,11 @@ class RigidityTuning:
     """Residual of a rigid mover's flow relative to that of the static scene. Chosen on
     real clips and the demo: rendered boxes have 0.6 to 1.3 (2.4 before cameras that
     jump), people 1.6 to 6.5, their raised arms alone 1.1 to 1.3."""
+    max_shape_error: float = 0.25
+    """Median distance of a rigid mover's tracks from its shape, in their standard
+    deviations: rendered boxes have 0.06 to 0.15, pieces of a hammer 0.2, people and
+    hands mostly 0.26 to 0.8, a talking face 0.45. Where the static scene shakes, flow
+    alone would call the face rigid."""
     min_uncertainty_px: float = 0.1
     """Flow is never taken to be surer than this, exact flow of a rendered scene
     neither."""
