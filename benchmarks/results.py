@@ -79,13 +79,12 @@ SECTIONS = (
     Section(
         "bench-convergence",
         "Methods at convergence",
-        "Two of these scenes until PSNR rises by less than 0.1 dB in the last fifth; on "
-        "`interior`, `splat` still rises by 0.2 and `grid` by 0.4 while the learning rate falls "
-        "(`grid` ended at 27.2 / 21.8 after a third of this time), on `lamp` `grid` by 0.14. "
+        "Two of these scenes until PSNR rises by less than 0.1 dB in the last fifth, at most for "
+        "60 minutes, after which `grid` still rises by 0.2 on both while the learning rate falls. "
         "During the run: eight views after 1/8, 1/4, 1/2, 4/5 and all of it, one thread each. "
         "No baseline reaches what `splat` has after an eighth, however long it trains. `splat` "
-        "gains 1.8 dB on `interior` after that and loses 0.4 on `lamp`, where `grid` ends 0.3 dB "
-        "below it and 1.1 above it on movers: priors limit both. HDR-HexPlane overfits "
+        "gains 1.0 dB on `interior` after that and loses 0.4 on `lamp`, where `grid` ends 0.5 dB "
+        "below it and 1.0 above it on movers: priors limit both. HDR-HexPlane overfits "
         "`interior` from half of its run on; its published protocol, the left half of views, is "
         "not ours.",
         "hdr-nsff bench OUT --scenes SCENE --methods nerf-wt,hdr-hexplane,nsff,splat,grid --budget "
