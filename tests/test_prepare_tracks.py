@@ -93,7 +93,7 @@ def test_exported_to_nerfstudio_tracks_become_cameras(config: PrepareConfig) -> 
 
 
 def test_given_maps_of_tracks_are_found_by_the_names_of_the_tracks(config: PrepareConfig) -> None:
-    width = {"bright": 8, "dark": 4}  # of what moves, in the mask of either
+    width = {"bright": 8, "dark": 4}  # px that move in each mask
     for name, columns in width.items():
         for t in range(COUNT):
             mask = np.arange(W)[None, :].repeat(H, 0) < columns
