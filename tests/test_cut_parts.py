@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import pytest
 from posed_clips import panning
 
 from hdr_nsff import pipeline
-from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.errors import InputError, NoSceneError
 from hdr_nsff.core.images import write_png
 from hdr_nsff.footage.cuts import find_cuts
 from hdr_nsff.pipeline import RunConfig
@@ -151,6 +152,59 @@ def test_a_part_that_is_too_short_is_left_out(
     assert [len(sources(scene)) for scene in scenes] == [18, 18]
     said = " ".join(capsys.readouterr().err.split())
     assert "frames 18 to 25 are left out, too few for a scene" in said
+
+
+def fails_for(*names: str) -> Step:
+    """A step that finds no poses in the scene folders `names`."""
+
+    def find(work: Work) -> StepResult:
+        if work.folder.name in names:
+            raise NoSceneError(f"no poses in {work.folder.name}")
+        return StepResult(note="")
+
+    return Step(find, needs=("exposure",))
+
+
+@pytest.mark.parametrize("failed", ["part_00", "part_01"])
+def test_a_part_that_makes_no_scene_is_left_out(
+    failed: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(prepare, "STEPS", {**prepare.STEPS, "poses": fails_for(failed)})
+    config = PrepareConfig(clip_of(tmp_path / "clip", 20, 14), tmp_path / "out")
+    (scene,) = prepare_scenes(config)
+    assert scene.name == ("part_01" if failed == "part_00" else "part_00")
+    assert Manifest.load(scene).steps["poses"].done
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"{failed} of 2 is left out: no poses in {failed}" in said
+    monkeypatch.setattr(prepare, "STEPS", {**prepare.STEPS, "poses": fails_for()})
+    assert len(prepare_scenes(config)) == 2
+
+
+def test_where_no_part_makes_a_scene_the_longest_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    both = fails_for("part_00", "part_01")
+    monkeypatch.setattr(prepare, "STEPS", {**prepare.STEPS, "poses": both})
+    config = PrepareConfig(clip_of(tmp_path / "clip", 14, 20), tmp_path / "out")
+    with pytest.raises(NoSceneError, match="no poses in part_01"):
+        prepare_scenes(config)
+
+
+def test_other_errors_of_a_part_end_the_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fill_disk(work: Work) -> StepResult:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    full = Step(fill_disk, needs=("exposure",))
+    monkeypatch.setattr(prepare, "STEPS", {**prepare.STEPS, "poses": full})
+    config = PrepareConfig(clip_of(tmp_path / "clip", 20, 14), tmp_path / "out")
+    with pytest.raises(InputError, match="No space left"):
+        prepare_scenes(config)
+    assert not (tmp_path / "out/part_01").exists()
 
 
 def test_where_no_part_is_long_enough_the_clip_is_refused(tmp_path: Path) -> None:

@@ -8,6 +8,10 @@ class InputError(ValueError):
     """Bad input. One sentence says what is wrong, where, and how to fix it."""
 
 
+class NoSceneError(InputError):
+    """Pictures that make no scene, whatever the settings are."""
+
+
 def shorten(text: object, limit: int = 80) -> str:
     """`text` as a message quotes it: on one line, with at most `limit` characters.
 

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.errors import NoSceneError
 from hdr_nsff.geometry import pinhole
 from hdr_nsff.geometry.lens import Lens
 
@@ -112,7 +112,7 @@ def interpolate(poses: Poses, groups: list[list[int]]) -> Poses:
 
     `groups` holds the frames of each physical camera in order; neighbors are registered
     frames of the same camera. Poses are held constant at the ends of the clip.
-    InputError where a camera has no registered frame.
+    NoSceneError where a camera has no registered frame.
     """
     c2w = poses.c2w.copy()
     filled: list[int] = []
@@ -122,7 +122,7 @@ def interpolate(poses: Poses, groups: list[list[int]]) -> Poses:
         if not missing:
             continue
         if not known:
-            raise InputError(
+            raise NoSceneError(
                 f"poses failed: none of the frames of one camera could be registered "
                 f"(frames {format_ranges(missing)}); {ADVICE}"
             )

@@ -15,7 +15,7 @@ from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
-from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.errors import InputError, NoSceneError
 from hdr_nsff.core.hashes import hash_file
 from hdr_nsff.core.io import writing_to
 from hdr_nsff.core.lock import lock_output
@@ -103,18 +103,30 @@ def prepare_scenes(config: PrepareConfig, part_cuts: bool = True) -> list[Path]:
 def prepare_parts(config: PrepareConfig, parts: list[ClipPart]) -> list[Path]:
     """The scene folders of a clip's `parts`, each prepared as a clip of its own, the
     longest first.
+
+    A part that makes no scene, such as one whose poses are not found, is left out;
+    NoSceneError where all are.
     """
     say(f"{config.clip}: the picture cuts; each part becomes a scene of its own")
     settings = part_settings(config, parts)
     first = longest(parts)
     scenes: dict[int, list[Path]] = {}
+    refused: dict[int, NoSceneError] = {}
     for k in (first, *(k for k in range(len(parts)) if k != first)):
         part, own = parts[k], settings[k]
         say(f"{own.out.name}: frames {part.start} to {part.end - 1} of the clip")
-        if k != first and part.cycle and part.cycle == parts[first].cycle:
+        if first in scenes and k != first and part.cycle and part.cycle == parts[first].cycle:
             own = with_exposures_of(settings[first].out, part, own)
-        scenes[k] = prepare_scenes(own, part_cuts=False)
-    return [scene for k in range(len(parts)) for scene in scenes[k]]
+        try:
+            scenes[k] = prepare_scenes(own, part_cuts=False)
+        except NoSceneError as error:
+            refused[k] = error
+            say(f"{own.out.name}: makes no scene: {error}")
+    if not scenes:
+        raise refused[first]
+    for k, reason in sorted(refused.items()):
+        say(f"{settings[k].out.name} of {len(parts)} is left out: {reason}")
+    return [scene for k in range(len(parts)) for scene in scenes.get(k, [])]
 
 
 def truth_place(config: PrepareConfig) -> Path:

@@ -4,9 +4,9 @@ exposures and one response.
 The folder `clip` holds what is found once, of the whole clip: frames, exposures, flow
 as matched, poses. A segment takes its part of them, and finds masks and depth of its
 own. Static points of all segments give the one response. Then each segment refines its
-flow and finds its movers and its depth. Files that segments take are second names of
-the same files where the disk allows it, so they need no space. Times are those of the
-whole clip.
+flow and finds its movers and its depth. Pictures and flow that segments take are second
+names of the same files where the disk allows it, so they need no space. Times are those
+of the whole clip.
 """
 
 from __future__ import annotations
@@ -308,7 +308,7 @@ def take_response(clip: Work, work: Work) -> StepResult:
             name: {index: getattr(f, name) for index, f in enumerate(own)}
             for name in ("drift", "white_balance")
         },
-        files={"response.json": partial(link, clip.folder / "response.json")},
+        files={"response.json": partial(shutil.copyfile, clip.folder / "response.json")},
     )
 
 

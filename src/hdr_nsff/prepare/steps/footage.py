@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.errors import InputError, NoSceneError
 from hdr_nsff.core.images import write_png
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage.cuts import find_cuts
@@ -143,14 +143,14 @@ def check_count(clip: Path, times: int) -> None:
 
 
 def check_frames(clip: Path, entries: list[FrameEntry], extents: list[tuple[float, float]]) -> None:
-    """InputError where frames are too few, or all black or white.
+    """InputError where frames are too few; NoSceneError where all are black or white.
 
     `extents` are the recorded values between which nearly all of each frame lies.
     """
     check_count(clip, len({entry.time for entry in entries}))
     color = exposure.all_clipped(extents)
     if color is not None:
-        raise InputError(
+        raise NoSceneError(
             f"{clip}: all frames are {color}; nothing can be learned from them, choose other frames"
         )
 
@@ -302,7 +302,7 @@ def cameras_in_turn(work: Work) -> int:
     return given
 
 
-class ClipCutsError(InputError):
+class ClipCutsError(NoSceneError):
     """The picture cuts to another scene."""
 
     def __init__(self, problem: str, first: list[int]) -> None:

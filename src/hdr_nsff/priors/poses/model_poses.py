@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.errors import NoSceneError
 from hdr_nsff.footage.colmap import ColmapModel
 from hdr_nsff.geometry.pinhole import intrinsics
 from hdr_nsff.geometry.poses import (
@@ -36,8 +36,8 @@ def poses_from_model(
     """Poses of all frames from a reconstruction of the views, in a normalized world.
 
     `scale`: how many times larger the images of the reconstruction are than the frames
-    of `size` (height, width). InputError where a camera has no registered view, or too
-    few points remain.
+    of `size` (height, width). NoSceneError where a camera has no registered view, or
+    too few points remain.
     """
     count, (height, width) = len(views.of_frame), size
     image_of = views_of_images(model)
@@ -46,7 +46,7 @@ def poses_from_model(
     for group in views.groups:
         images = [image_of[v] for v in group if v in image_of]
         if not images:
-            raise InputError(
+            raise NoSceneError(
                 "poses failed: none of the frames of one camera could be registered "
                 f"(views {format_ranges(group)}); {RIG_ADVICE}"
             )
@@ -79,10 +79,10 @@ def gather_tracks(model: ColmapModel, views: SfmViews, scale: int) -> np.ndarray
 
 def normalize_world(poses: Poses, tuning: ReconstructionTuning) -> Poses:
     """The same cameras and points in a world of their own: the mean registered camera
-    at the origin, looking along +z, near at 1. InputError for too few points.
+    at the origin, looking along +z, near at 1. NoSceneError for too few points.
     """
     if len(poses.points) < tuning.min_points:
-        raise InputError(
+        raise NoSceneError(
             f"poses failed: only {len(poses.points)} static points were reconstructed; {ADVICE}"
         )
     registered = poses.c2w[poses.registered]
