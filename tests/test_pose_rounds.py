@@ -62,7 +62,10 @@ def rounds(tmp_path, monkeypatch, models):
         frames = [SimpleNamespace(index=t, track=0, camera_id=t % cameras) for t in range(T)]
         work = SimpleNamespace(
             folder=tmp_path,
-            manifest=SimpleNamespace(rig=1, num_tracks=1, frames=frames),
+            config=SimpleNamespace(lens_distortion="none"),
+            manifest=SimpleNamespace(
+                rig=1, num_tracks=1, num_cameras=1, frames=frames, lens={}, width=W, height=H
+            ),
             raw_flows=(None, None),
             equalized=(video, np.zeros((T, H, W), bool)),
         )
@@ -72,9 +75,9 @@ def rounds(tmp_path, monkeypatch, models):
     return run
 
 
-def mask(column: int) -> np.ndarray:
+def mask(column: int, width: int = 20) -> np.ndarray:
     moving = np.zeros((T, H, W), bool)
-    moving[:, 40:60, column : column + 20] = True
+    moving[:, 40:60, column : column + width] = True
     return moving
 
 
@@ -115,14 +118,38 @@ def test_restless_masks_alone_do_not(rounds, share):
 
 
 @pytest.mark.parametrize("fails", [2, 3])
-def test_a_later_round_that_fails_leaves_the_poses_of_the_one_before(rounds, capsys, fails):
-    poses, estimates = rounds(0.3, *RESTLESS, fails=fails)
+@pytest.mark.parametrize("more", [28, 160])
+def test_a_later_round_that_fails_leaves_the_poses_of_the_one_before(rounds, capsys, fails, more):
+    masks = [*RESTLESS[:fails], mask(0, width=more)]
+    poses, estimates = rounds(0.3, *masks, fails=fails)
     assert poses.parallax == "full" and poses.registered.all() and estimates == fails
     (note,) = poses.notes
     assert note.startswith("in doubt: the next round failed with masks from these: poses failed")
     assert "7 of 8 frames; give --tripod" in note and note in " ".join(
         capsys.readouterr().err.split()
     )
+
+
+@pytest.mark.parametrize("fails", [2, 3])
+def test_where_a_camera_at_rest_explains_the_flow_as_well_it_stands_still(rounds, capsys, fails):
+    masks = [*RESTLESS[:fails], mask(0, width=25)]
+    poses, estimates = rounds(0.3, *masks, fails=fails)
+    assert poses.parallax == "none" and estimates == fails
+    assert np.array_equal(poses.c2w, PLACED.c2w)
+    note = poses.notes[-1]
+    assert "stands still, since the next round failed, and only 3% of the pixels move" in note
+    assert note in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_camera_at_rest_that_leaves_much_moving_does_not(rounds):
+    wide = [np.ones((T, H, W), bool) & (np.arange(W) % 2 == k) for k in (0, 1, 0)]
+    poses, _ = rounds(0.3, *wide, fails=2)
+    assert poses.parallax == "full" and "in doubt" in poses.notes[-1]
+
+
+def test_of_several_cameras_none_is_at_rest(rounds):
+    poses, _ = rounds(0.3, *RESTLESS[:2], fails=2, cameras=2)
+    assert poses.parallax == "full" and "in doubt" in poses.notes[-1]
 
 
 def test_a_later_round_that_fails_where_rotations_explain_the_footage_means_a_turn(rounds):
