@@ -137,7 +137,7 @@ def test_where_a_camera_at_rest_explains_the_flow_as_well_it_stands_still(rounds
     assert poses.parallax == "none" and estimates == fails
     assert np.array_equal(poses.c2w, PLACED.c2w)
     note = poses.notes[-1]
-    assert "stands still, since the next round failed, and only 3% of the pixels move" in note
+    assert "stands still, since the next round failed, and only 3% of the pixels move then" in note
     assert note in " ".join(capsys.readouterr().err.split())
 
 

@@ -277,7 +277,7 @@ def poses_at_rest(work: Work, moving: np.ndarray) -> Poses | None:
         return None
     note = (
         "treated as a camera that stands still, since the next round failed, and only "
-        f"{found:.0%} of the pixels move before one; give --poses if it moves"
+        f"{found:.0%} of the pixels move then; give --poses if the camera moves"
     )
     say(f"poses: {note}")
     return replace(poses, notes=(*poses.notes, note))
