@@ -169,8 +169,8 @@ SECTIONS = (
         "flow with a little noise. PSNR over the run is of four of the held-out views. On one "
         "core that computes in bfloat16; others take longer. The order is that of the paper: "
         "HDR-NSFF, NeRF-WT, NSFF. NSFF does not rise: it has no exposures, and frames that "
-        "alternate contradict each other (published: 16 to 18 dB). Other programs ran on the other "
-        "core.",
+        "alternate contradict each other (published: 16 to 18 dB). The first quarter of "
+        "`paper-small` took 9 minutes; later other programs shared the core.",
         "hdr-nsff synth interior interior --size 120x68 --spp 64 --truth-spp 64 --oracle && "
         "hdr-nsff bench OUT --scenes interior --oracle --methods "
         '"paper-small=paper-small --torch-threads 1,..."',

@@ -297,7 +297,7 @@ def cameras_in_turn(work: Work) -> int:
         absent = min(set(range(given)) - seen)
         raise InputError(
             f"--rig {given}: of camera {absent}, counted from 0, all frames are missing by their "
-            "times; correct the number, or the times in the list of exposures"
+            "times; correct the number, --stride, or the times in the list of exposures"
         )
     return given
 
