@@ -73,6 +73,8 @@ def test_frames_of_two_segments_have_one_camera_exposure_and_picture(config):
         assert (read_codes(pictures[0]) == read_codes(pictures[1])).all()
     responses = [path.read_bytes() for path in sorted(config.out.glob("*/response.json"))]
     assert len(responses) == 3 and len(set(responses)) == 1
+    for path in config.out.glob("*/response.json"):  # each may be edited on its own
+        assert path.stat().st_nlink == 1
 
 
 def test_segments_equal_the_whole_clip_where_everything_is_given(config, tmp_path):
