@@ -170,7 +170,7 @@ SECTIONS = (
         "core that computes in bfloat16; others take longer. The order is that of the paper: "
         "HDR-NSFF, NeRF-WT, NSFF. NSFF does not rise: it has no exposures, and frames that "
         "alternate contradict each other (published: 16 to 18 dB). The first quarter of "
-        "`paper-small` took 9 minutes; later other programs shared the core.",
+        "`paper-small` took 9 minutes beside small programs; later, larger ones shared the core.",
         "hdr-nsff synth interior interior --size 120x68 --spp 64 --truth-spp 64 --oracle && "
         "hdr-nsff bench OUT --scenes interior --oracle --methods "
         '"paper-small=paper-small --torch-threads 1,..."',
@@ -213,9 +213,10 @@ SECTIONS = (
     Section(
         "bench-default-time",
         "The default time, and three times as much",
-        "`boreal_walk` of 640x400 pixels and 24 frames, from frames alone, one thread each, beside "
-        "another run. PSNR over the run is of the held-out frames, of which there are two. Three "
-        "times the default time gains less than 0.1 dB.",
+        "`boreal_walk` of 640x400 pixels and 24 frames, without movers, from frames alone, on a "
+        "scene of an earlier commit, one thread each, beside another run. PSNR over the run is of "
+        "the held-out frames, of which there are two. Three times the default time gains less "
+        "than 0.1 dB.",
         'hdr-nsff bench OUT --scenes boreal_walk=SCENE --methods "splat=splat --torch-threads 1" '
         "--views 3` and once more with `--budget 26.7min",
         bench_rise,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from posed_clips import panning
 
-from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.errors import InputError, NoSceneError
 from hdr_nsff.footage.colmap import ColmapCamera, ColmapImage, ColmapModel
 from hdr_nsff.geometry.lens import Lens
 from hdr_nsff.priors.poses import reconstruct, sfm
@@ -122,6 +122,23 @@ def test_no_more_mappings_than_allowed_are_tried(tmp_path, monkeypatch, limit, t
     with pytest.raises(InputError, match="nothing matches"):
         best_model(views_of(5), tmp_path, 1, "sift", tuning)
     assert len(jobs) == tried
+
+
+@pytest.mark.parametrize(
+    ("reason", "blames_pictures"), [("nothing matches", True), (sfm.KILLED, False)]
+)
+def test_a_machine_that_fails_does_not_speak_against_the_pictures(
+    tmp_path, monkeypatch, reason, blames_pictures
+):
+    def fail(tries, at_once):
+        return (sfm.SfmError(reason) for _ in tries)
+
+    job = sfm.Job(str(tmp_path), [[]], [], 100.0, "match")
+    monkeypatch.setattr(reconstruct, "write_job", lambda *_: job)
+    monkeypatch.setattr(sfm, "run_in_turn", fail)
+    with pytest.raises(InputError) as refusal:
+        best_model(views_of(5), tmp_path, 1, "sift")
+    assert isinstance(refusal.value, NoSceneError) == blames_pictures
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ class InputError(ValueError):
 
 
 class NoSceneError(InputError):
-    """Pictures that make no scene, whatever the settings are."""
+    """Pictures of which no scene can be made, though the settings make sense."""
 
 
 def shorten(text: object, limit: int = 80) -> str:

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from hdr_nsff.core.errors import NoSceneError
+from hdr_nsff.core.errors import InputError, NoSceneError
 from hdr_nsff.core.images import encode
 from hdr_nsff.core.process import usable_cores
 from hdr_nsff.core.progress import say
@@ -187,7 +187,8 @@ def best_model(
 ) -> tuple[ColmapModel, int]:
     """The best reconstruction of the views, and how many times larger than the views
     its images were. A learned `matcher` runs on `device`. NoSceneError where no
-    reconstruction is good enough. `mapping` is the lens to map with.
+    reconstruction is good enough, InputError where the memory did not suffice.
+    `mapping` is the lens to map with.
 
     Matches and poses of `earlier` rounds, on the same views with other pixels ignored,
     are used again; this round's are added in place.
@@ -236,7 +237,9 @@ def best_model(
     best = search.best
     least = tuning.min_registered * search.count
     if best is None or len(best.images) < least or not has_plausible_lens(best, tuning):
-        raise NoSceneError(failure_message(best, views, search.failures, tuning))
+        killed = best is None and sfm.KILLED in search.failures  # the machine's fault
+        kind = InputError if killed else NoSceneError
+        raise kind(failure_message(best, views, search.failures, tuning))
     return best, scale
 
 
