@@ -264,12 +264,14 @@ def bench_convergence(document: Document) -> Lines:
 
 
 def bench_rise(document: Document) -> Lines:
-    """One line per method: its scores, and PSNR during the run on a few views."""
+    """One line per run: its scores, and PSNR during the run where views were kept."""
     shares = [point["share"] for point in document["results"][0]["curve"]]
+    several = len({run["scene"] for run in document["results"]}) > 1
     rows = []
     for run in document["results"]:
         values = run["values"]
-        row = [f"`{run['method']}`", pair(values, "psnr", "psnr_moving")]
+        name = f"`{run['method']}`" + (f", `{run['scene']}`" if several else "")
+        row = [name, pair(values, "psnr", "psnr_moving")]
         row += [number(values.get("ssim"), 3), pair(values, "mu5000", "mu5000_moving")]
         rise = {point["share"]: point["scores"]["psnr"] for point in run["curve"]}
         row += [number(rise.get(share), 1) for share in shares]
