@@ -22,8 +22,10 @@ from hdr_nsff.radiometry.debevec import (
     ScaleEvidence,
     brackets_linked,
     debevec,
+    shows_mid_tones,
 )
 from hdr_nsff.radiometry.frame_exposures import FrameExposuresTuning
+from hdr_nsff.radiometry.moving_samples import FlowLinks, moving_samples
 from hdr_nsff.radiometry.response import Response, Source
 from hdr_nsff.radiometry.sensor_noise import SensorNoiseTuning, noise_log_likelihood
 from hdr_nsff.radiometry.static_samples import ResponseView, static_samples
@@ -58,13 +60,23 @@ def bracket_response(
     num_cameras: int,
     tuning: ResponseTuning = ResponseTuning(),
     lossless: bool = False,
+    links: FlowLinks | None = None,
 ) -> Response:
-    """The response where all frames of a bracket have one exposure."""
+    """The response where all frames of a bracket have one exposure.
+
+    Points on movers, followed along `links`, help where static ones do not link all
+    brackets or do not show the mid-tones.
+    """
     brackets = {v.bracket for v in views}
     if len(brackets) == 1:
         return from_brightness(views, ev, reference, num_cameras, "one exposure", "")
     rng = np.random.default_rng(SEED)
     samples = static_samples(views, len(ev), tuning.num_samples, rng)
+    num_static = len(samples.rgb)
+    suffices = brackets_linked(samples, brackets, tuning.debevec)
+    if links is not None and not (suffices and shows_mid_tones(samples, tuning.debevec)):
+        moving = moving_samples(views, links, len(ev), tuning.num_samples, rng)
+        samples = samples.with_more(moving)
     if not brackets_linked(samples, brackets, tuning.debevec):
         problem = "too few static points seen in several exposures"
         return from_brightness(views, ev, reference, num_cameras, "brightness", problem)
@@ -83,6 +95,7 @@ def bracket_response(
         source="static points",
         misfit=fit.misfit,
         num_points=len(samples.rgb),
+        num_moving=len(samples.rgb) - num_static,
         guessed=fit.guessed,
         own_curves=tuple(sorted(own)),
         measured_scale=scale.measured / scale.factor,

@@ -64,6 +64,11 @@ class BracketingTuning:
     min_chance: float = 0.4
     max_deviations: float = 2.0  # of a measured step from the usual one that it becomes
 
+    def without_mid_tones(self) -> BracketingTuning:
+        """The same where no point shows the curve's mid-tones: any curve may be odd."""
+        odd = self.odd_log_factor_deviation
+        return replace(self, log_factor_deviation=odd, one_step_log_factor_deviation=odd)
+
 
 @dataclass(frozen=True)
 class StepScale:

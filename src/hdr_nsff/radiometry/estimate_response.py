@@ -29,6 +29,7 @@ from hdr_nsff.radiometry.frame_exposures import (
     is_determined,
     read_points,
 )
+from hdr_nsff.radiometry.moving_samples import FlowLinks
 from hdr_nsff.radiometry.response import Response
 from hdr_nsff.radiometry.sensor_noise import noise_log_likelihood
 from hdr_nsff.radiometry.static_samples import ResponseView
@@ -52,6 +53,7 @@ def estimate_response(
     lossless: bool = False,
     drift: np.ndarray | None = None,
     may_drift: bool = True,
+    links: FlowLinks | None = None,
 ) -> Response:
     """Response and exposures from recorded frames with depth and poses.
 
@@ -60,9 +62,12 @@ def estimate_response(
     disparity (all 0) contribute brightness only. `lossless`: the frames were never
     compressed with loss, so that they show the noise of the sensor. Where single frames
     differ from their brackets, `drift` of the response is by how much; `drift` (V,) is
-    given where it is known, and looked for only if exposures `may_drift`.
+    given where it is known, and looked for only if exposures `may_drift`. `links`: flow
+    between the views, which finds points on movers where static ones tell too little.
     """
-    response = bracket_response(views, view_cameras, ev, reference, num_cameras, tuning, lossless)
+    response = bracket_response(
+        views, view_cameras, ev, reference, num_cameras, tuning, lossless, links
+    )
     if num_cameras > 1:
         return response
     if drift is not None:

@@ -29,10 +29,11 @@ class Response:
     white_balance: np.ndarray  # (C, 3) stops, 0 for camera 0
     source: Source
     misfit: float | None  # median absolute error of a static point's exposure, in stops
-    num_points: int  # static points used
+    num_points: int  # points used
     guessed: bool  # the common factor of all `ev` is the likeliest one, not measured
     own_curves: tuple[int, ...]  # cameras with a curve of their own, of several cameras
     problem: str = ""  # why not from static points, in words
+    num_moving: int = 0  # of these points, those on movers; not stored
     # what pixels say against given exposures of frames, in words; not stored
     disagreement: str = ""
     # where no exposure was known: the common factor that would turn all `ev` into what

@@ -29,7 +29,7 @@ def describe_source(response: Response, given_ev: Sequence[float | None]) -> str
                 how += f" ({response.problem})"
             unknown = "unknown ones from the brightness of the frames"
         case "static points":
-            how = f"{response.num_points} static points, misfit {response.misfit:.3f} stops"
+            how = f"{describe_points(response)}, misfit {response.misfit:.3f} stops"
             if response.problem:
                 how += f", {response.problem}"
             if len(response.y) > 1:
@@ -43,6 +43,14 @@ def describe_source(response: Response, given_ev: Sequence[float | None]) -> str
     if all(e is not None for e in given_ev) and not response.guessed:
         unknown = "as given"
     return f"{how}; EV {steps} ({unknown}){describe_drift(response)}"
+
+
+def describe_points(response: Response) -> str:
+    """How many points the response is from."""
+    if not response.num_moving:
+        return f"{response.num_points} static points"
+    num_static = response.num_points - response.num_moving
+    return f"{num_static} static points and {response.num_moving} on movers"
 
 
 def describe_one_exposure(response: Response) -> str:

@@ -86,8 +86,12 @@ def static_samples(
         samples_of_view(source, views, patches, num_brackets, points_per_view, rng, tuning)
         for source in track(range(len(views)), "response: points")
     ]
-    if not parts:
-        parts = [empty_samples(0, num_brackets)]
+    return joined(parts, num_brackets)
+
+
+def joined(parts: Sequence[Samples], num_brackets: int) -> Samples:
+    """The samples of all `parts`, every part a frame of its own."""
+    parts = parts or [empty_samples(0, num_brackets)]
     return Samples(
         np.concatenate([p.rgb for p in parts]),
         np.concatenate([p.valid for p in parts]),

@@ -18,6 +18,7 @@ from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.radiometry.estimate_response import estimate_response
 from hdr_nsff.radiometry.frame_colors import FrameColorsTuning, frame_white_balance
+from hdr_nsff.radiometry.moving_samples import FlowLinks
 from hdr_nsff.radiometry.response_words import describe
 from hdr_nsff.radiometry.static_samples import ResponseView
 from hdr_nsff.scene.manifest import FrameEntry
@@ -43,6 +44,7 @@ def find_response(work: Work, views: Sequence[ResponseView] | None = None) -> St
         lossless=shows_noise(work),
         drift=given_drift(work),
         may_drift=may_drift(work),
+        links=flow_links(work),
     )
     colors = given = None
     if m.rig == m.num_cameras == 1:
@@ -68,6 +70,19 @@ def find_response(work: Work, views: Sequence[ResponseView] | None = None) -> St
         },
         files={"response.json": lambda path: write_response(path, response)},
     )
+
+
+def flow_links(work: Work) -> FlowLinks:
+    """The flow between training frames."""
+    place = {f.index: k for k, f in enumerate(work.train)}
+    targets = [[place[j] for j in f.raw_flow if j in place] for f in work.train]
+
+    def read(source: int, target: int) -> tuple[np.ndarray, np.ndarray]:
+        files = work.train[source].raw_flow[work.train[target].index]
+        flow = read_npy(work.folder / files.flow).astype(np.float32)
+        return flow, read_mask(work.folder / files.valid)
+
+    return FlowLinks(targets, read)
 
 
 def shows_noise(work: Work) -> bool:
