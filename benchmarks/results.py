@@ -137,8 +137,8 @@ SECTIONS = (
         "Alternating exposures as filmed (`hand_books`, `nv_balloon1`: re-exposed; `gopro`: auto "
         "exposure), nothing given but the poses of the two and the GoPro's metadata. Measured on "
         "every eighth frame, of the two on other frames of the original. Moving pixels are those "
-        "of the estimated masks. 2 minutes of training are on one thread, beside another run. "
-        "`gopro` is the first 40 frames.",
+        "of the estimated masks. 2 minutes of training are on one thread, beside another run; "
+        "`grid` is of earlier commits. `gopro` is the first 40 frames.",
         "hdr-nsff bench OUT --scenes CLIP,CLIP,... --methods splat --steps 800 --max-size 320 "
         "--views 0` and `--methods splat,grid --budget 2min --views 0 --jobs 2",
         bench_clips,
