@@ -12,13 +12,13 @@ from hdr_nsff.radiometry.debevec import (
     HIGH,
     LOW,
     SATURATED,
-    Samples,
     brackets_linked,
     debevec,
     response_of,
     saturation,
     typical_factor,
 )
+from hdr_nsff.radiometry.samples import Samples
 
 
 def points(curve, ev, num=700, outliers=0.0, seed=0):

@@ -8,7 +8,7 @@ import pytest
 from wall import S_CURVE, SRGB, X, wall_view
 
 from hdr_nsff.radiometry import frame_exposures
-from hdr_nsff.radiometry.debevec import DebevecTuning, Samples
+from hdr_nsff.radiometry.debevec import DebevecTuning
 from hdr_nsff.radiometry.estimate_response import estimate_response
 from hdr_nsff.radiometry.frame_exposures import (
     Readings,
@@ -21,6 +21,7 @@ from hdr_nsff.radiometry.frame_exposures import (
     steepness_factor,
 )
 from hdr_nsff.radiometry.response_words import describe
+from hdr_nsff.radiometry.samples import Samples
 from hdr_nsff.radiometry.static_samples import ResponseView
 
 NUM = 24

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from wall import HEIGHT, S_CURVE, WIDTH, K, X, record
 
-from hdr_nsff.radiometry.debevec import Samples, shows_mid_tones
+from hdr_nsff.radiometry.debevec import shows_mid_tones
 from hdr_nsff.radiometry.estimate_response import estimate_response
 from hdr_nsff.radiometry.moving_samples import FlowLinks, moving_samples
 from hdr_nsff.radiometry.response import Response
 from hdr_nsff.radiometry.response_words import describe
+from hdr_nsff.radiometry.samples import Samples
 from hdr_nsff.radiometry.static_samples import ResponseView
 
 EV = [-2.0, 0.0]
@@ -127,6 +128,16 @@ def test_movers_serve_where_nothing_static_is_seen_twice(views: list[ResponseVie
     response = respond(alone, exact_links(alone))
     assert response.source == "static points" and response.num_points == response.num_moving
     np.testing.assert_allclose(response.ev, EV, atol=0.05)
+
+
+def test_given_exposures_of_frames_are_held_against_static_points_alone() -> None:
+    rng = np.random.default_rng(0)
+    dim = [view(k, rng, wall=0.18) for k in range(NUM_VIEWS)]
+    links, cameras, drift = exact_links(dim), [0] * NUM_VIEWS, np.zeros(NUM_VIEWS)
+    assert estimate_response(dim, cameras, EV, 1, 1, links=links).num_moving > 0
+    response = estimate_response(dim, cameras, EV, 1, 1, drift=drift, links=links)
+    assert response.disagreement == "" and response.num_points > 0
+    assert response.num_moving == 0 and "on movers" not in describe(response, EV)
 
 
 def test_mid_tones_count_only_where_two_brackets_link_them() -> None:

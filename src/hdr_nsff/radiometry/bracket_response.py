@@ -27,6 +27,7 @@ from hdr_nsff.radiometry.debevec import (
 from hdr_nsff.radiometry.frame_exposures import FrameExposuresTuning
 from hdr_nsff.radiometry.moving_samples import FlowLinks, moving_samples
 from hdr_nsff.radiometry.response import Response, Source
+from hdr_nsff.radiometry.samples import joined
 from hdr_nsff.radiometry.sensor_noise import SensorNoiseTuning, noise_log_likelihood
 from hdr_nsff.radiometry.static_samples import ResponseView, static_samples
 
@@ -76,7 +77,7 @@ def bracket_response(
     suffices = brackets_linked(samples, brackets, tuning.debevec)
     if links is not None and not (suffices and shows_mid_tones(samples, tuning.debevec)):
         moving = moving_samples(views, links, len(ev), tuning.num_samples, rng)
-        samples = samples.with_more(moving)
+        samples = joined([samples, moving], len(ev))
     if not brackets_linked(samples, brackets, tuning.debevec):
         problem = "too few static points seen in several exposures"
         return from_brightness(views, ev, reference, num_cameras, "brightness", problem)

@@ -27,6 +27,7 @@ import numpy as np
 
 from hdr_nsff.maths.color import srgb_decode
 from hdr_nsff.radiometry.bracketing import BracketingTuning, StepScale, likely_scale
+from hdr_nsff.radiometry.samples import Samples
 
 # recorded values outside carry little: noise and rounding below, compression above
 # (hand-chosen for 8 bits)
@@ -79,28 +80,6 @@ class DebevecTuning:
     # median misfits: points farther off fell into shadow between two frames
     max_saturation_misfit: float = 3.0
     bracketing: BracketingTuning = field(default_factory=BracketingTuning)
-
-
-@dataclass(frozen=True)
-class Samples:
-    """Points recorded in several exposures."""
-
-    rgb: np.ndarray  # (P, B, 3) recorded, in [0, 1]
-    valid: np.ndarray  # (P, B, 3) bool: seen there, and away from black and saturation
-    saturated: np.ndarray  # (P, B, 3) bool: seen there, and saturated
-    frame: np.ndarray | None = None  # (P,) where the point was chosen; None: unknown
-    # (P, B) stops by which a recording's exposure exceeds its bracket's; None: 0
-    offset: np.ndarray | None = None
-
-    def with_more(self, other: Samples) -> Samples:
-        """These points and those of `other`, chosen in the same frames."""
-        assert self.frame is not None and other.frame is not None
-        return Samples(
-            np.concatenate([self.rgb, other.rgb]),
-            np.concatenate([self.valid, other.valid]),
-            np.concatenate([self.saturated, other.saturated]),
-            np.concatenate([self.frame, other.frame]),
-        )
 
 
 @dataclass(frozen=True)

@@ -111,6 +111,7 @@ def with_given_drift(
         source="static points",
         misfit=fit.misfit,
         num_points=len(readings.frame),
+        num_moving=0,
         guessed=False,
         problem="",
         disagreement=disagreement(seen, exposures, tuning),

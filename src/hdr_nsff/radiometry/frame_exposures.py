@@ -21,12 +21,12 @@ from hdr_nsff.core.progress import track
 from hdr_nsff.core.stack import LazyList
 from hdr_nsff.geometry import pinhole
 from hdr_nsff.maths.color import srgb_decode
-from hdr_nsff.radiometry.debevec import MAD_TO_SIGMA, DebevecTuning, Samples, debevec
+from hdr_nsff.radiometry.debevec import MAD_TO_SIGMA, DebevecTuning, debevec
+from hdr_nsff.radiometry.samples import Samples, empty_samples, joined
 from hdr_nsff.radiometry.static_samples import (
     KEPT_PATCHES,
     ResponseView,
     StaticSamplesTuning,
-    empty_samples,
     enter_readings,
     spread_over_levels,
     view_patches,
@@ -82,7 +82,7 @@ def read_points(
         depth = 1 / np.maximum(view.disparity[pixels[:, 1], pixels[:, 0]], 1e-9)
         world = pinhole.unproject(pixels + 0.5, depth, view.K, view.c2w)
         others = [source, *(source + k for k in tuning.reach)]
-        samples = empty_samples(len(world), len(others))
+        samples = empty_samples(len(world), len(others), source)
         for slot, other in enumerate(others):
             if 0 <= other < len(views):
                 seen = visible_points(views[other], patches[other], world, points)
@@ -92,11 +92,7 @@ def read_points(
         height, width = view.image.shape[:2]
         places.append((pixels + 0.5) / [width, height])
     return Readings(
-        Samples(
-            np.concatenate([p.rgb for p in parts]),
-            np.concatenate([p.valid for p in parts]),
-            np.concatenate([p.saturated for p in parts]),
-        ),
+        joined(parts, 1 + len(tuning.reach)),
         np.concatenate(frames),
         np.concatenate(places),
     )

@@ -14,15 +14,13 @@ import numpy as np
 
 from hdr_nsff.core.progress import track
 from hdr_nsff.core.stack import LazyList
-from hdr_nsff.radiometry.debevec import Samples
+from hdr_nsff.radiometry.samples import Samples, empty_samples, joined
 from hdr_nsff.radiometry.static_samples import (
     KEPT_PATCHES,
     PatchStatistics,
     ResponseView,
     StaticSamplesTuning,
-    empty_samples,
     enter_readings,
-    joined,
     patch_statistics,
     spread_over_levels,
 )
@@ -78,7 +76,7 @@ def samples_of_movers(
         followed |= valid
     pixels = spread_over_levels(view.image, own.good & followed, num, rng, tuning)
     columns, rows = pixels.T
-    samples = empty_samples(len(pixels), num_brackets)
+    samples = empty_samples(len(pixels), num_brackets, source)
     enter_readings(samples, view.bracket, own, np.ones(len(pixels), bool), rows, columns)
     for k in sorted(others, key=lambda k: abs(views[k].time - view.time)):
         flow, valid = flows[k]

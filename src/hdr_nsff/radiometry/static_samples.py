@@ -18,7 +18,8 @@ import numpy as np
 from hdr_nsff.core.progress import track
 from hdr_nsff.core.stack import LazyList
 from hdr_nsff.geometry import pinhole
-from hdr_nsff.radiometry.debevec import HIGH, LOW, SATURATED, Samples
+from hdr_nsff.radiometry.debevec import HIGH, LOW, SATURATED
+from hdr_nsff.radiometry.samples import Samples, empty_samples, joined
 
 # frames whose patches are in memory at a time: those around one in time, both ways
 KEPT_PATCHES = 56
@@ -89,17 +90,6 @@ def static_samples(
     return joined(parts, num_brackets)
 
 
-def joined(parts: Sequence[Samples], num_brackets: int) -> Samples:
-    """The samples of all `parts`, every part a frame of its own."""
-    parts = parts or [empty_samples(0, num_brackets)]
-    return Samples(
-        np.concatenate([p.rgb for p in parts]),
-        np.concatenate([p.valid for p in parts]),
-        np.concatenate([p.saturated for p in parts]),
-        np.repeat(np.arange(len(parts)), [len(p.rgb) for p in parts]),
-    )
-
-
 def samples_of_view(
     source: int,
     views: Sequence[ResponseView],
@@ -114,7 +104,7 @@ def samples_of_view(
     pixels = spread_over_levels(view.image, patches[source].good, num, rng, tuning)
     depth = 1 / np.maximum(view.disparity[pixels[:, 1], pixels[:, 0]], 1e-9)
     points = pinhole.unproject(pixels + 0.5, depth, view.K, view.c2w)
-    samples = empty_samples(len(points), num_brackets)
+    samples = empty_samples(len(points), num_brackets, source)
     nearest_first = sorted(range(len(views)), key=lambda i: abs(views[i].time - view.time))
     for other in nearest_first:
         seen_by = views[other]
@@ -126,12 +116,6 @@ def samples_of_view(
         visible, rows, columns = visible_points(seen_by, patches[other], points, tuning)
         enter_readings(samples, seen_by.bracket, patches[other], visible, rows, columns)
     return samples
-
-
-def empty_samples(num_points: int, num_brackets: int) -> Samples:
-    """Points that nothing is known of yet."""
-    shape = (num_points, num_brackets, 3)
-    return Samples(np.zeros(shape), np.zeros(shape, bool), np.zeros(shape, bool))
 
 
 def enter_readings(
