@@ -29,6 +29,7 @@ from hdr_nsff.viewer.scene_file import to_bytes
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 import camera_path
+import draw_scene
 import hdr_video
 import read_scene
 import render_view
@@ -41,7 +42,7 @@ def draw(path: Path, toy: Scene, time: float) -> np.ndarray:
     """What the example draws with the camera of the second frame."""
     camera = toy.train[1].camera.resized(*SIZE)
     document, arrays = read_scene.read(path)
-    return read_scene.draw(document, arrays, time, camera.c2w.numpy(), camera.K.numpy(), *SIZE)
+    return draw_scene.draw(document, arrays, time, camera.c2w.numpy(), camera.K.numpy(), *SIZE)
 
 
 @pytest.mark.parametrize("preset", ["splat", "splat-sigmoid"])
