@@ -1,9 +1,12 @@
-"""The readout of a rolling shutter, from pictures warped row by row."""
+"""The shake of a picture and the readout of a rolling shutter, from pictures warped
+row by row.
+"""
 
 import cv2
 import numpy as np
 import pytest
 
+from hdr_nsff.check.picture_motion import affine_motions, measure_shake
 from hdr_nsff.check.shutter import measure_readout
 from hdr_nsff.priors.poses.matching import PairMatches, detect_keypoints, match_pairs
 
@@ -66,3 +69,34 @@ def test_a_steady_pan_does_not_determine_it() -> None:
         for t in range(40)
     ]
     assert measure_readout(pan, (H, W)) is None
+
+
+def true_shake(seed: int = 0, amplitude: float = 6.0) -> tuple[float, float]:
+    """Shake and speed of `shaken_clip` from its frequencies, px."""
+    frequency, phase, strength = shake(seed, amplitude)
+    time = np.linspace(2, FRAMES - 3, 500)
+    turn = 2 * np.pi * frequency[..., None]
+    angles = turn * time + phase[..., None]
+    acceleration = -(turn**2 * strength[..., None] * np.sin(angles)).sum(1)  # (2, 500)
+    velocity = (turn * strength[..., None] * np.cos(angles)).sum(1)
+    found = 1.4826 * np.linalg.norm(np.median(np.abs(acceleration), axis=1))
+    return float(found), float(np.median(np.linalg.norm(velocity, axis=0)))
+
+
+def test_shake_is_the_acceleration_of_the_picture() -> None:
+    found = measure_shake(affine_motions(matches(shaken_clip(0.0)), (H, W)))
+    assert found == pytest.approx(true_shake(), rel=0.25)
+
+
+def test_a_steady_pan_does_not_shake() -> None:
+    places = np.random.default_rng(0).uniform(0, W, (200, 2))
+    rng = np.random.default_rng(1)
+    step = np.array([3.0, 1.0])
+    pan = [
+        PairMatches(t, t + 1, places, places + step + rng.normal(0, 0.2, places.shape))
+        for t in range(40)
+    ]
+    found = measure_shake(affine_motions(pan, (H, W)))
+    assert found is not None
+    assert found[0] < 0.03 and found[1] == pytest.approx(np.hypot(3, 1), abs=0.05)
+    assert measure_shake(affine_motions(pan[:18], (H, W))) is None

@@ -1,5 +1,6 @@
 """Exposures in a GoPro's metadata track."""
 
+import io
 import struct
 from pathlib import Path
 from typing import Any
@@ -99,3 +100,43 @@ def test_damaged_tracks_end_and_do_not_raise(noise: bytes, cut: int) -> None:
 def test_a_video_without_the_track_has_none(tmp_path: Path) -> None:
     (tmp_path / "clip.mp4").write_bytes(b"no video")
     assert gpmf.read_gopro(tmp_path / "clip.mp4", 3) is None
+
+
+def mp4_box(name: bytes, content: bytes, wide: bool = False) -> bytes:
+    """A box of an MP4 file, with a size of 32 or 64 bits."""
+    if wide:
+        return (1).to_bytes(4, "big") + name + (len(content) + 16).to_bytes(8, "big") + content
+    return (len(content) + 8).to_bytes(4, "big") + name + content
+
+
+def mp4_file(settings: bytes, wide: bool = False) -> bytes:
+    """The boxes of a file that a GoPro writes around its settings."""
+    user = mp4_box(b"udta", mp4_box(b"FIRM", b"H19") + mp4_box(b"GPMF", settings))
+    header = mp4_box(b"mvhd", bytes(100)) + user
+    return mp4_box(b"ftyp", b"mp41") + mp4_box(b"mdat", bytes(50), wide) + mp4_box(b"moov", header)
+
+
+@pytest.mark.parametrize("wide", [False, True])
+@pytest.mark.parametrize(("written", "expected"), [(b"Y", True), (b"N", False), (None, None)])
+def test_stabilization_is_what_the_header_says(
+    tmp_path: Path, written: bytes | None, expected: bool | None, wide: bool
+) -> None:
+    found = entry(b"DVNM", b"c", 1, b"Camera")
+    if written is not None:
+        found += entry(b"EISE", b"c", 1, written)
+    (tmp_path / "clip.mp4").write_bytes(mp4_file(entry(b"DEVC", b"\0", 1, found), wide))
+    assert gpmf.stabilized(tmp_path / "clip.mp4") is expected
+
+
+@given(st.binary(max_size=60), st.integers(0, 260), st.booleans())
+def test_damaged_headers_are_read_to_their_end(noise: bytes, cut: int, wide: bool) -> None:
+    whole = mp4_file(entry(b"DEVC", b"\0", 1, entry(b"EISE", b"c", 1, b"Y")), wide)
+    for data in (whole[:cut] + noise, whole[:cut] + noise + whole[cut:], whole[:cut]):
+        found = gpmf.box(io.BytesIO(data), len(data), b"moov", b"udta", b"GPMF")
+        assert len(found) <= len(data)
+
+
+def test_a_video_without_settings_says_nothing_of_stabilization(tmp_path: Path) -> None:
+    assert gpmf.stabilized(tmp_path / "absent.mp4") is None
+    (tmp_path / "clip.mp4").write_bytes(b"no video")
+    assert gpmf.stabilized(tmp_path / "clip.mp4") is None

@@ -29,6 +29,7 @@ class FileFacts:
     bars: str = ""  # what `prepare` does with black bars, in words
     interlaced: bool = False  # by the marks of its frames
     same_camera: bool = False  # the `cameras` are tracks of one
+    stabilized: bool | None = None  # electronically, as the camera wrote; None: unknown
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,9 @@ class CameraFacts:
     # of a rolling shutter, as a share of the time between frames, and its standard
     # error; None: unknown
     readout: tuple[float, float] | None = None
+    # of the picture's center, pixels of the clip: acceleration per frame squared and
+    # velocity per frame; None: unknown
+    shake: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from hdr_nsff.check.facts import FileFacts
 from hdr_nsff.core.video import frame_times, video_info
 from hdr_nsff.footage.exposure_lists import row_of
 from hdr_nsff.footage.footage import TRANSFER_NAMES, Footage
+from hdr_nsff.footage.gpmf import stabilized
 from hdr_nsff.footage.ingest import MAX_FRAMES, read_frames
 from hdr_nsff.footage.timestamps import (
     frame_gaps,
@@ -48,6 +49,7 @@ def describe_file(footage: Footage) -> FileFacts:
         bars=footage.bars.sentence() if footage.bars else "",
         interlaced=footage.interlaced,
         same_camera=footage.same_camera,
+        stabilized=stabilized(first) if footage.video else None,
         **measure_timing(footage),
     )
 

@@ -43,6 +43,10 @@ class FindingTuning:
     min_banding_ev: float = 0.05
     max_interval_ratio: float = 1.5  # longest to shortest time between frames
     min_readout: float = 0.1  # share of the time between frames
+    min_speed: float = 5e-4  # of the picture's width a frame, below which it hardly moves
+    # shake relative to speed: 0.06 and 0.09 for a drone and a camera that stabilizes,
+    # 0.13 and more for hands and the heads of tripods
+    max_smooth: float = 0.1
     few_frames: int = 12
     many_frames: int = 150
     sure_parallax: float = 0.5  # rotations explain less than this share: parallax is clear
@@ -58,12 +62,7 @@ def judge(facts: ClipFacts, tuning: FindingTuning = FindingTuning()) -> list[Fin
         *judge_file(facts, tuning),
         *judge_lens(facts),
         *judge_shutter(facts, tuning),
-        Finding(
-            "note",
-            "not checked",
-            "electronic stabilization is not measured",
-            "turn stabilization off",
-        ),
+        *judge_stabilization(facts, tuning),
     ]
 
 
@@ -311,6 +310,32 @@ def judge_shutter(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
         text += f", {readout * ms:.0f} ms"
         advice += f", or give `--readout {readout * ms:.0f}` (or auto) to `prepare` or `run`"
     yield Finding("note", "shutter", text, advice)
+
+
+def judge_stabilization(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
+    """Electronic stabilization, as the camera wrote, else by what is left of shake."""
+    subject, off = "stabilizer", "turn electronic stabilization off"
+    if facts.file.stabilized is not None:
+        on = facts.file.stabilized
+        text = f"electronic stabilization was {'on' if on else 'off'}, as the camera wrote"
+        yield Finding("warning" if on else "good", subject, text, "turn it off" if on else "")
+        return
+    if facts.camera.shake is None:
+        text = "stabilization is not measured: too few frames in a row match"
+        yield Finding("note", subject, text, off)
+        return
+    shake, speed = facts.camera.shake
+    if facts.camera.motion == "tripod" or speed < tuning.min_speed * facts.file.width:
+        text = "the picture hardly moves, so electronic stabilization does not show"
+        yield Finding("note", subject, text, off)
+        return
+    measured = f"from frame to frame it moves by {speed:.1f} px, which change by {shake:.1f} px"
+    if shake < tuning.max_smooth * speed:
+        text = f"the picture moves as if on rails, held by a gimbal or stabilized: {measured}"
+        yield Finding("note", subject, text, off)
+    else:
+        text = f"the picture shakes, as it does without electronic stabilization: {measured}"
+        yield Finding("good", subject, text)
 
 
 def judge_file(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:

@@ -16,6 +16,7 @@ from hdr_nsff.check.facts import CameraFacts, CameraMotion, ClipFacts, ExposureF
 from hdr_nsff.check.file import describe_file
 from hdr_nsff.check.given import GivenExposures, given_exposures
 from hdr_nsff.check.lens import measure_lens
+from hdr_nsff.check.picture_motion import affine_motions, measure_shake
 from hdr_nsff.check.shutter import measure_readout
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.progress import track
@@ -232,6 +233,7 @@ def measure_camera(
     if motion == "parallax" and enough:
         lens = measure_lens(equalized, clipped, scale)
     height, width = equalized.shape[1:3]
+    shake = measure_shake(affine_motions(following, (height, width)))
     readout = None
     if motion != "tripod":
         readout = measure_readout(following, (height, width), portrait=height > width)
@@ -242,6 +244,7 @@ def measure_camera(
         long_sharpness=compare_sharpness(equalized, clipped, cycle, tuning),
         lens=lens,
         readout=None if readout is None else (round(readout[0], 3), round(readout[1], 3)),
+        shake=None if shake is None else (round(scale * shake[0], 3), round(scale * shake[1], 3)),
     )
 
 

@@ -14,21 +14,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hdr_nsff.check.picture_motion import ACCELERATION, AFFINE, affine_motions
 from hdr_nsff.priors.poses.matching import PairMatches
-
-# change of the velocity between two frames, from five motions between frames around
-# them: differences of fourth order of the positions
-ACCELERATION = np.array([1, -8, 0, 8, -1]) / 12
 
 
 @dataclass(frozen=True)
 class ShutterTuning:
     """When a readout counts as measured (hand-chosen on warped pictures)."""
 
-    min_points: int = 40  # matches of a pair
     min_pairs: int = 15
-    reweightings: int = 10
-    outlier_scale: float = 2.0  # standard deviations: of the Cauchy weights
+    reweightings: int = AFFINE.reweightings
+    outlier_scale: float = AFFINE.outlier_scale
     max_error: float = 0.12  # standard error, share of a frame's time
     max_readout: float = 1.2  # no shutter takes longer than a frame's time
 
@@ -47,8 +43,7 @@ def measure_readout(
     """
     height, width = size
     length = width if portrait else height
-    center = np.array([width, height]) / 2
-    fits = [fit_affine(pair, center, portrait, tuning) for pair in following]
+    fits = affine_motions(following, size, portrait)
     rows, values = [], []
     for t in range(2, len(fits) - 2):
         around = [fit for fit in fits[t - 2 : t + 3] if fit is not None]
@@ -69,31 +64,6 @@ def measure_readout(
     if error > tuning.max_error or not -2 * error <= readout <= tuning.max_readout:
         return None
     return max(readout, 0.0), error
-
-
-def fit_affine(
-    pair: PairMatches, center: np.ndarray, portrait: bool, tuning: ShutterTuning
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """The motion (2,) px of the picture's center in a pair of frames, and its gradient
-    (2, 2), by robust least squares; None where too little matches.
-    """
-    if len(pair.p) < tuning.min_points:
-        return None
-    places, moved = pair.p - center, pair.q - pair.p
-    if portrait:
-        places, moved = places[:, ::-1], moved[:, ::-1]
-    # centered between both frames, where motion has no part in the gradient
-    places = places + moved / 2
-    design = np.column_stack([places, np.ones(len(places))])
-    weights = np.ones(len(places))
-    solution = np.zeros((3, 2))
-    for _ in range(tuning.reweightings):
-        root = np.sqrt(weights)[:, None]
-        solution = np.linalg.lstsq(design * root, moved * root, rcond=None)[0]
-        residual = np.linalg.norm(moved - design @ solution, axis=1)
-        scale = tuning.outlier_scale * max(float(np.median(residual)), 1e-3)
-        weights = 1 / (1 + (residual / scale) ** 2)
-    return solution[2], solution[:2].T
 
 
 def regress(design: np.ndarray, values: np.ndarray, tuning: ShutterTuning) -> tuple[float, float]:

@@ -4,7 +4,8 @@ Format (GPMF, https://github.com/gopro/gpmf-parser).
 The track's packets are nested entries of a key of four letters, a type, the size of a
 value, their number, and the values, padded to four bytes. `SHUT` holds exposure times
 in seconds, `ISOE` the sensor's sensitivity, both once a frame. `WRGB` holds gains of
-red, green and blue (white balance), ten times a second.
+red, green and blue (white balance), ten times a second. The header holds settings in
+the same format.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -23,6 +25,7 @@ TYPES = {b"f": ">f4", b"S": ">u2", b"L": ">u4", b"s": ">i2", b"l": ">i4"}
 # of frames, by which their number may differ from that of the written exposures
 MAX_MISSING_SHARE = 0.02
 MAX_DEPTH = 16  # of entries in entries: cameras write four
+MAX_BOX = 1 << 20  # bytes of settings: cameras write a few thousand
 
 
 @dataclass(frozen=True)
@@ -110,21 +113,64 @@ def metadata_packets(path: Path) -> Iterator[bytes]:
         return  # the frames were read: whatever is wrong with this track, they count
 
 
-def entries(data: bytes, depth: int = 0) -> Iterator[tuple[bytes, np.ndarray]]:
-    """Keys and values of all entries of numbers in a packet, nested up to `MAX_DEPTH`.
+def entries(data: bytes) -> Iterator[tuple[bytes, np.ndarray]]:
+    """Keys and values of all entries of numbers in a packet."""
+    for key, kind, size, content in raw_entries(data):
+        if kind in TYPES and size % np.dtype(TYPES[kind]).itemsize == 0:
+            yield key, np.frombuffer(content, TYPES[kind]).astype(np.float64)
+
+
+def raw_entries(data: bytes, depth: int = 0) -> Iterator[tuple[bytes, bytes, int, bytes]]:
+    """Key, type, bytes a value and content of all entries, nested up to `MAX_DEPTH`.
 
     An entry that is cut short, as in a damaged file, ends its level.
     """
     start = 0
     while start + HEADER_BYTES <= len(data):
-        key, kind = data[start : start + 4], data[start + 4 : start + 5]
-        size = data[start + 5] * int.from_bytes(data[start + 6 : start + HEADER_BYTES], "big")
+        key, kind, each = data[start : start + 4], data[start + 4 : start + 5], data[start + 5]
+        size = each * int.from_bytes(data[start + 6 : start + HEADER_BYTES], "big")
         content = data[start + HEADER_BYTES : start + HEADER_BYTES + size]
         if len(content) < size:
             return
-        if kind[0] == NESTED:
-            if depth < MAX_DEPTH:
-                yield from entries(content, depth + 1)
-        elif kind in TYPES and size % np.dtype(TYPES[kind]).itemsize == 0:
-            yield key, np.frombuffer(content, TYPES[kind]).astype(np.float64)
+        if kind[0] != NESTED:
+            yield key, kind, size, content
+        elif depth < MAX_DEPTH:
+            yield from raw_entries(content, depth + 1)
         start += HEADER_BYTES + -(-size // 4) * 4
+
+
+def stabilized(path: Path) -> bool | None:
+    """Whether a GoPro wrote into a video's header that its electronic stabilization was
+    on (`EISE`); None where it wrote nothing of it.
+    """
+    try:
+        with path.open("rb") as file:
+            header = box(file, path.stat().st_size, b"moov", b"udta", b"GPMF")
+    except OSError:
+        return None
+    for key, _, _, content in raw_entries(header):
+        if key == b"EISE":
+            return content[:1] == b"Y"
+    return None
+
+
+def box(file: BinaryIO, end: int, name: bytes, *inside: bytes) -> bytes:
+    """The content of a box of an MP4 file, and of one `inside` it, up to `MAX_BOX`
+    bytes; empty where there is none (ISO 14496-12, 4.2).
+
+    Looks from where the file is read on, up to its byte `end`.
+    """
+    while file.tell() + 8 <= end:
+        start = file.tell()
+        size, kind = int.from_bytes(file.read(4), "big"), file.read(4)
+        if size == 1:
+            size = int.from_bytes(file.read(8), "big")
+        last = end if size == 0 else start + size
+        if not file.tell() <= last <= end:
+            return b""
+        if kind == name and inside:
+            return box(file, last, *inside)
+        if kind == name:
+            return file.read(min(last - file.tell(), MAX_BOX))
+        file.seek(last)
+    return b""
