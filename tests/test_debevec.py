@@ -6,19 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from wall import EV, GAMMA22, S_CURVE, SRGB, record, rmse
+from wall import EV, GAMMA22, S_CURVE, SRGB, X, record, rmse
 
-from hdr_nsff.radiometry.debevec import (
-    HIGH,
-    LOW,
-    SATURATED,
-    brackets_linked,
-    debevec,
-    response_of,
-    saturation,
-    typical_factor,
-)
+from hdr_nsff.radiometry.debevec import brackets_linked, debevec, typical_factor
+from hdr_nsff.radiometry.log_curve import HIGH, LOW, SATURATED, Top, log_exposures, response_of
 from hdr_nsff.radiometry.samples import Samples
+from hdr_nsff.radiometry.saturation import saturation
 
 
 def points(curve, ev, num=700, outliers=0.0, seed=0):
@@ -107,9 +100,10 @@ def test_saturation_is_where_recordings_begin_to_saturate():
     light = np.minimum(4 * dark, 1)
     rgb = np.stack([dark, light], 1).repeat(3, -1)  # (P, 2, 3)
     samples = Samples(rgb, (rgb > 0) & (rgb < 0.99), rgb >= 1)
-    curve = np.zeros(42)
-    curve[40] = 1.0  # G = ln z
-    assert saturation(samples, 0, curve, np.log([1.0, 4.0])) == pytest.approx(0.0, abs=0.01)  # ln 1
+    curves = np.zeros((3, 42))
+    curves[:, 40] = 1.0  # G = ln z
+    top = saturation(samples, curves, np.log([1.0, 4.0]))
+    assert top.level == pytest.approx(0.0, abs=0.01) and (top.shown == 1).all()  # ln 1
 
 
 def test_shadows_do_not_move_saturation():
@@ -123,16 +117,40 @@ def test_shadows_do_not_move_saturation():
     light[300:330] = 0.3
     rgb = np.stack([dark, light], 1).repeat(3, -1)
     samples = Samples(rgb, rgb < 0.99, rgb >= 1)
-    curve = np.zeros(42)
-    curve[40] = 1.0
-    assert saturation(samples, 0, curve, np.log([1.0, 4.0])) == pytest.approx(0.0, abs=0.01)
+    curves = np.zeros((3, 42))
+    curves[:, 40] = 1.0
+    top = saturation(samples, curves, np.log([1.0, 4.0]))
+    assert top.level == pytest.approx(0.0, abs=0.01)
+
+
+def test_a_channel_without_clipped_points_rises_as_the_others_do():
+    """Of red, only what is recorded below 0.3 is seen. Grays must not get a color."""
+    curve = np.stack([S_CURVE[2]] * 3)
+    seen = points(curve, EV, num=3000)
+    seen.valid[..., 0] &= seen.rgb[..., 0] < 0.3
+    seen.saturated[..., 0] = False
+    fit = debevec(seen, EV, reference=2)
+    at = np.array([np.interp([0.5, 0.8], y, fit.x) for y in fit.y])
+    np.testing.assert_allclose(np.log2(at / np.interp([0.5, 0.8], curve[0], X)), 0, atol=0.1)
+
+
+def test_channels_that_clip_keep_their_own_curves():
+    curves = np.zeros((3, 42))
+    curves[:, 40] = [2.0, 2.2, 3.0]
+    z = np.linspace(0.01, 0.99, 50)
+    own = np.outer([2.0, 2.2, 3.0], np.log(z))
+    np.testing.assert_allclose(log_exposures(z, curves, np.ones(3)), own)
+    followed = log_exposures(z, curves, np.array([1.0, 1.0, 0.4]))
+    np.testing.assert_allclose(followed[:2], own[:2])
+    rise = np.where(z > 0.4, 2.2 * np.log(z / 0.4) + 3 * np.log(0.4), own[2])
+    np.testing.assert_allclose(followed[2], rise)
 
 
 def test_the_response_rises_even_where_the_fit_falls():
     curves = np.zeros((3, 42))
     curves[:, 20:30] = -3.0  # a deep dent in G
     curves[:, 40] = 2.2
-    x, y = response_of(curves, tops=np.zeros(3))
+    x, y = response_of(curves, Top(np.zeros(3), np.ones(3)))
     assert y[:, 0].tolist() == [0, 0, 0] and y[:, -1] == pytest.approx(1.0)
     assert (np.diff(y, axis=-1) >= 0).all() and len(x) == 256
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hdr_nsff.radiometry.debevec import GAMMA, HIGH, LOW
+from hdr_nsff.radiometry.log_curve import GAMMA, HIGH, LOW
 
 
 def brightness_ev(

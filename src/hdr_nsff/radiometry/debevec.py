@@ -19,7 +19,6 @@ are taken to be usual ones. The proportions of the steps are measured.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -27,19 +26,19 @@ import numpy as np
 
 from hdr_nsff.maths.color import srgb_decode
 from hdr_nsff.radiometry.bracketing import BracketingTuning, StepScale, likely_scale
+from hdr_nsff.radiometry.log_curve import (
+    GAMMA,
+    LN2,
+    NODES,
+    TYPICAL,
+    UNKNOWNS,
+    basis,
+    response_of,
+)
 from hdr_nsff.radiometry.samples import Samples
+from hdr_nsff.radiometry.saturation import SaturationTuning, own_tops, saturation
 
-# recorded values outside carry little: noise and rounding below, compression above
-# (hand-chosen for 8 bits)
-LOW, HIGH = 3 / 255, 252.5 / 255
-SATURATED = 254.5 / 255  # rounds to the highest of 8-bit codes
-NODES = 40  # of H
-UNKNOWNS = NODES + 2  # of a channel: the nodes of H, then a and b
-TYPICAL = (1.1, 0.5)  # a and b half way between gamma 2.2 and sRGB
-GAMMA = 2.2  # of the response assumed by estimates from brightness alone
 LEFT_OUT = 1e-6  # robust weight of a point that is far off: it may come back
-MIN_VALUE = 1e-4  # recorded values are raised to this before their logarithm
-LN2 = float(np.log(2))
 MAD_TO_SIGMA = 1.48  # standard deviation of a normal distribution per median |deviation|
 # stops: with a larger misfit the points are not the same points (hand-chosen on
 # recorded clips)
@@ -76,9 +75,7 @@ class DebevecTuning:
     # real clips, steps were off by factors of 2.1 and 0.8 with 0.001 and 0.04 of them,
     # and right with 0.08 and more
     min_mid_tones: float = 0.05
-    min_saturation_points: int = 30  # of each kind; with fewer, saturation is extrapolated
-    # median misfits: points farther off fell into shadow between two frames
-    max_saturation_misfit: float = 3.0
+    saturation: SaturationTuning = field(default_factory=SaturationTuning)
     bracketing: BracketingTuning = field(default_factory=BracketingTuning)
 
 
@@ -165,12 +162,13 @@ def debevec(
         curves, log_exposure[free] = solve(equations, noise, len(free), tuning)
         equations, noise = reweight(equations, curves, log_exposure[free], tuning)
     factor, scale = 1.0, None
-    tops = np.array([saturation(samples, c, curves[c], log_exposure, tuning) for c in range(3)])
+    top = saturation(samples, curves, log_exposure, tuning.saturation)
     if guessed:
         factor = typical_factor(curves, tuning)
         noise_log_likelihood = None
         if evidence is not None:
-            x, y = response_of(curves * factor, tops * factor)
+            own = own_tops(curves, top)
+            x, y = response_of(curves * factor, own.scaled(factor))
             noise_log_likelihood = evidence(x, y, log_exposure * factor / LN2)
         residuals = all_residuals(equations, curves, log_exposure[free])
         deviations = exposure_deviations(equations, residuals, samples.frame)
@@ -184,7 +182,7 @@ def debevec(
             bracketing,
         )
         factor *= scale.factor
-    x, y = response_of(curves * factor, tops * factor)
+    x, y = response_of(curves * factor, top.scaled(factor))
     misfit = median_misfit(equations, curves, log_exposure[free]) * factor / LN2
     return ResponseFit(x, y, log_exposure * factor / LN2, misfit, guessed, scale)
 
@@ -229,16 +227,6 @@ def channel_equations(
     weight = z**2 * np.clip((1 - z) / tuning.shoulder_width, 0, 1)
     weight = np.where(seen_twice, weight, 0.0)
     return Equations(design, target, weight, np.ones_like(weight))
-
-
-def basis(z: np.ndarray) -> np.ndarray:
-    """Rows [H's hat functions, ln z, ln srgb^-1(z)] (..., 42), whose product with a
-    channel's solution (42,) is G(z).
-    """
-    position = 2 / np.pi * np.arcsin(np.sqrt(np.clip(z, 0, 1))) * (NODES - 1)
-    hats = np.clip(1 - np.abs(position[..., None] - np.arange(NODES)), 0, 1)
-    z = np.maximum(z, MIN_VALUE)
-    return np.concatenate([hats, np.log(z)[..., None], np.log(srgb_decode(z))[..., None]], -1)
 
 
 def solve(
@@ -345,86 +333,6 @@ def typical_factor(curves: np.ndarray, tuning: DebevecTuning = DebevecTuning()) 
     srgb = np.log(srgb_decode(z))
     mean_curve, srgb = mean_curve - mean_curve.mean(), srgb - srgb.mean()
     return float(mean_curve @ srgb / (mean_curve @ mean_curve))
-
-
-def saturation(
-    samples: Samples,
-    channel: int,
-    curve: np.ndarray,
-    log_exposure: np.ndarray,
-    tuning: DebevecTuning = DebevecTuning(),
-) -> float:
-    """G(1), the log exposure at which a channel with `curve` (42,) saturates.
-
-    It is the level that best separates saturated from unsaturated recordings of points
-    whose exposure is known from a darker bracket. Extrapolated where there are too few
-    of either kind.
-    """
-    extrapolated = float(basis(np.array(1.0)) @ curve)
-    lowest = float(basis(np.array(HIGH)) @ curve)
-    saturated, unsaturated = levels_from_darker(samples, channel, curve, log_exposure, tuning)
-    if min(len(saturated), len(unsaturated)) < tuning.min_saturation_points:
-        return max(extrapolated, lowest)
-    candidates = np.linspace(lowest - 0.5, max(extrapolated, lowest) + 1.0, 301)
-    saturated_below = np.searchsorted(np.sort(saturated), candidates)
-    unsaturated_below = np.searchsorted(np.sort(unsaturated), candidates)
-    num_wrong = saturated_below + len(unsaturated) - unsaturated_below
-    best = candidates[num_wrong == num_wrong.min()]
-    return max(float(best.mean()), lowest + 1e-3)
-
-
-def levels_from_darker(
-    samples: Samples,
-    channel: int,
-    curve: np.ndarray,
-    log_exposure: np.ndarray,
-    tuning: DebevecTuning = DebevecTuning(),
-) -> tuple[np.ndarray, np.ndarray]:
-    """Log exposures of recordings, predicted from a darker bracket: those of saturated
-    (N,) and of unsaturated recordings (M,), without points that fell into shadow.
-    """
-    valid, is_saturated = samples.valid[..., channel], samples.saturated[..., channel]
-    recorded = np.where(valid, basis(samples.rgb[..., channel]) @ curve, np.nan)  # (P, B)
-    saturated, unsaturated = [np.zeros(0)], [np.zeros(0)]
-    misfits = [np.zeros(0)]
-    levels = np.broadcast_to(log_exposure, valid.shape)  # (P, B)
-    if samples.offset is not None:
-        levels = levels + LN2 * samples.offset
-    for dark, light in itertools.permutations(range(valid.shape[1]), 2):
-        is_darker = levels[:, dark] < levels[:, light]
-        predicted = recorded[:, dark] - levels[:, dark] + levels[:, light]
-        both = valid[:, dark] & valid[:, light] & is_darker
-        saturated.append(predicted[valid[:, dark] & is_saturated[:, light] & is_darker])
-        unsaturated.append(predicted[both])
-        misfits.append(np.abs(predicted - recorded[:, light])[both])
-    misfit = np.concatenate(misfits)
-    if not misfit.size:
-        return np.concatenate(saturated), np.zeros(0)
-    same_light = misfit <= tuning.max_saturation_misfit * np.median(misfit)
-    return np.concatenate(saturated), np.concatenate(unsaturated)[same_light]
-
-
-def response_of(
-    curves: np.ndarray, tops: np.ndarray, num: int = 256
-) -> tuple[np.ndarray, np.ndarray]:
-    """x (num,), even in x^(1/2.2), and the response y (3, num) that ends at (1, 1).
-
-    It is exp(G - top), made monotone and inverted, of `curves` (3, 42) that saturate at
-    `tops` (3,). Where G falls, it is replaced by the mean of its upper and lower
-    monotone envelopes.
-    """
-    z = np.linspace(0, HIGH, 1025)[1:]
-    x = np.linspace(0, 1, num) ** GAMMA
-    tie_breaker = np.linspace(-1e-9, 0, len(z))  # makes the exposures strictly rising
-    y = []
-    for g, top in zip((basis(z) @ curves.T).T, tops, strict=True):
-        upper = np.maximum.accumulate(g)
-        lower = np.minimum.accumulate(g[::-1])[::-1]
-        rising = (upper + lower) / 2
-        exposure = np.exp(np.minimum(rising - top, -1e-6) + tie_breaker)  # below 1
-        knots = np.concatenate([[0], exposure, [1]])
-        y.append(np.interp(x, knots, np.concatenate([[0], z, [1]])))
-    return x, np.stack(y)
 
 
 def brackets_linked(

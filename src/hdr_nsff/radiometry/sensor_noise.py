@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from scipy.optimize import nnls
 
-from hdr_nsff.radiometry.debevec import HIGH, LOW
+from hdr_nsff.radiometry.log_curve import HIGH, LOW
 
 # answers to linear and quadratic texture with 0, to white noise of deviation 1 with 1
 # (Immerkaer 1996)

@@ -18,7 +18,7 @@ import numpy as np
 from hdr_nsff.core.progress import track
 from hdr_nsff.core.stack import LazyList
 from hdr_nsff.geometry import pinhole
-from hdr_nsff.radiometry.debevec import HIGH, LOW, SATURATED
+from hdr_nsff.radiometry.log_curve import HIGH, LOW, SATURATED
 from hdr_nsff.radiometry.samples import Samples, empty_samples, joined
 
 # frames whose patches are in memory at a time: those around one in time, both ways
