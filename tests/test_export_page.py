@@ -71,6 +71,18 @@ def test_an_hdr_video_is_inside_the_page_if_it_is_small(
     assert '{"href": "render/training_hlg_av1.mp4", "text": "HDR clip"}' in page
 
 
+def test_a_page_in_any_folder_holds_the_hdr_video_of_its_own_run(
+    toy: Scene, tmp_path: Path
+) -> None:
+    run = make_run(toy, tmp_path / "clip" / "run")
+    for folder, data in (("clip", b"mine"), ("sent", b"of another run")):
+        (tmp_path / folder / "render").mkdir(parents=True)
+        (tmp_path / folder / "render" / "training_hlg.mp4").write_bytes(data)
+    page = export_page(run, tmp_path / "sent" / "scene.html").read_text()
+    assert base64.b64encode(b"mine").decode() in page
+    assert base64.b64encode(b"of another run").decode() not in page
+
+
 @pytest.mark.parametrize("options", [{"ply": True}, {"time": 1.0}, {"layout": "nerfstudio"}])
 def test_options_that_a_page_has_no_use_for_are_refused(options: dict) -> None:
     with pytest.raises(InputError, match="a page"):

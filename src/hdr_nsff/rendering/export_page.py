@@ -16,6 +16,7 @@ from hdr_nsff.core.progress import say
 from hdr_nsff.radiometry.hdr_footage import hdr_path
 from hdr_nsff.rendering.export_gaussians import NOT_OURS, ColorTransform, exposure_of
 from hdr_nsff.rendering.hdr_shots import TRANSFERS
+from hdr_nsff.rendering.output import render_folders
 from hdr_nsff.training.run_folder import Run
 from hdr_nsff.viewer.field_scene import scene_of
 from hdr_nsff.viewer.page_file import MARK, Link, PageSettings, make_page
@@ -99,8 +100,11 @@ def link_below(video: Path, folder: Path, text: str) -> Link | None:
 
 
 def find_hdr_clip(run: Run, folder: Path) -> Path | None:
-    """The HDR video as filmed that `render` has made for a page in `folder`, if any."""
-    for place in (folder / "render", run.folder / "render"):
+    """The HDR video as filmed that `render` or `run` has made, if any.
+
+    Those of the run come first, then what lies in `render` beside a page in `folder`.
+    """
+    for place in (*render_folders(run.folder), folder / "render"):
         for transfer in TRANSFERS:
             for codec in PLAYED_CODECS:
                 video = hdr_path(place, "training", transfer, codec)
