@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 from pathlib import Path
 
 import pytest
@@ -63,12 +64,27 @@ def test_an_hdr_video_is_inside_the_page_if_it_is_small(
     (tmp_path / "render" / "training_hlg_av1.mp4").write_bytes(b"hlg")
     held = base64.b64encode(b"hlg").decode()
     page = export_page(run, tmp_path / "scene.html").read_text()
-    assert f'<script id="clip-data" type="text/plain">{held}</script>' in page
+    assert f'<script id="training_hlg_av1.mp4" type="text/plain">{held}</script>' in page
     assert '{"href": "training_hlg_av1.mp4", "text": "HDR clip"}' in page
     monkeypatch.setattr("hdr_nsff.rendering.export_page.MAX_CLIP_BYTES", 2)
     page = export_page(run, tmp_path / "scene.html").read_text()
-    assert '<script id="clip-data"' not in page
+    assert held not in page
     assert '{"href": "render/training_hlg_av1.mp4", "text": "HDR clip"}' in page
+
+
+def test_of_two_codecs_the_one_that_more_browsers_play_stays_inside(
+    toy: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = make_run(toy, tmp_path / "run")
+    (tmp_path / "render").mkdir()
+    for name, size in (("training_hlg.mp4", 5), ("training_hlg_av1.mp4", 4)):
+        (tmp_path / "render" / name).write_bytes(bytes(size))
+    for limit, names in ((9, ["hlg.mp4", "hlg_av1.mp4"]), (8, ["hlg_av1.mp4"])):
+        monkeypatch.setattr("hdr_nsff.rendering.export_page.MAX_CLIP_BYTES", limit)
+        page = export_page(run, tmp_path / "scene.html").read_text()
+        links = [{"href": f"training_{name}", "text": "HDR clip"} for name in names]
+        assert f'"hdr_clips": {json.dumps(links)}' in page
+        assert page.count('.mp4" type="text/plain">') == len(names)
 
 
 def test_a_page_in_any_folder_holds_the_hdr_video_of_its_own_run(

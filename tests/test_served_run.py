@@ -4,6 +4,7 @@ checkpoint.
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -194,18 +195,20 @@ def test_videos_of_render_and_of_run_are_served(
 ) -> None:
     save_run(toy, toy_folder, tmp_path / "run")
     served = ServedRun(tmp_path / "run", "cpu")
-    assert served.videos() == {} and '"hdr_clip": null' in served.page()
+    assert served.videos() == {} and '"hdr_clips": []' in served.page()
     renders = tmp_path / "render"  # where `run` puts them
     renders.mkdir()
-    for name in ("training.mp4", "training_hlg.mp4", "other.mp4"):
+    clips = ["training_hlg.mp4", "training_hlg_av1.mp4"]
+    for name in ("training.mp4", *clips, "other.mp4"):
         (renders / name).write_bytes(b"")
-    videos = {f"/video/{name}": renders / name for name in ("training.mp4", "training_hlg.mp4")}
+    videos = {f"/video/{name}": renders / name for name in ("training.mp4", *clips)}
     assert served.videos() == videos
     again = tmp_path / "run/render"  # where `render` puts them
     again.mkdir()
     (again / "training.mp4").write_bytes(b"")
     assert served.videos() == videos | {"/video/training.mp4": again / "training.mp4"}
-    assert '{"href": "video/training_hlg.mp4", "text": "HDR clip"}' in served.page()
+    links = [{"href": f"video/{name}", "text": "HDR clip"} for name in clips]
+    assert f'"hdr_clips": {json.dumps(links)}' in served.page()
 
 
 def test_ctrl_c_ends_the_verb(toy: Scene, toy_folder: Path, tmp_path: Path) -> None:

@@ -80,6 +80,14 @@ def test_the_shot_as_filmed_has_an_hdr_video_where_one_can_be_encoded(
     assert with_hdr_clip(Output(), large) == Output()
 
 
+def test_without_an_encoder_of_av1_the_set_says_so_and_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(ENCODERS, "av1", "libnone")
+    assert set(render_all(fake_run(tmp_path), tmp_path / "out")) == NAMES
+    assert "no HDR clip in AV1" in capsys.readouterr().err
+
+
 def test_without_parallax_the_set_leaves_out_bullet_time(tmp_path: Path) -> None:
     results = render_all(fake_run(tmp_path, parallax="none"), tmp_path / "out")
     assert "bullet time" not in results and results["fixed camera"].exists()

@@ -15,12 +15,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import Page, browser, find_browser
-from test_hdr_video import ramp
+from test_export_gaussians import make_run
+from toy_scene import ToyScene
 from viewer_scenes import scene_file, trained
 from viewer_tab import TO_BASE64, open_page, png_text, read_linear, read_png, state
 
-from hdr_nsff.core.hdr_video import write_hdr_video
 from hdr_nsff.maths.hdr_signal import decode, rec709_to_rec2020
+from hdr_nsff.rendering.export_page import export_page
+from hdr_nsff.rendering.standard_set import render_all
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.viewer.page_file import Link, PageSettings, make_page
 from hdr_nsff.viewer.scene_file import to_bytes
@@ -153,25 +155,28 @@ def test_without_webgpu_the_page_names_the_clip(
     assert state(plain_tab, "curve") == "reinhard"
     assert plain_tab.run("viewer.hdr") is None
     assert "--hdr-video hlg" in plain_tab.run(note)
-    page = make_page("Toy", to_bytes(scene_file(toy)), with_clip(), b"")
+    page = make_page("Toy", to_bytes(scene_file(toy)), with_clip())
     (tmp_path / "scene.html").write_text(page)
     plain_tab.goto((tmp_path / "scene.html").as_uri(), 500, 300)
     assert "The HDR clip shows it" in plain_tab.run(note)
 
 
 def with_clip() -> PageSettings:
-    return PageSettings(hdr_clip=Link("toy_hlg.mp4", "HDR clip"))
+    return PageSettings(hdr_clips=[Link("toy_hlg.mp4", "HDR clip")])
 
 
-def test_the_clip_inside_the_page_plays(plain_tab: Page, toy: Scene, tmp_path: Path) -> None:
-    clip = tmp_path / "clip.mp4"
-    write_hdr_video(clip, [ramp("hlg")] * 24, 24, "hlg", "av1")
-    page = make_page("Toy", to_bytes(scene_file(toy)), with_clip(), clip.read_bytes())
-    (tmp_path / "scene.html").write_text(page)
-    plain_tab.goto((tmp_path / "scene.html").as_uri(), 500, 300)
+def test_the_clips_of_the_standard_set_play_inside_the_page(
+    plain_tab: Page, tmp_path: Path
+) -> None:
+    folder = ToyScene(width=128, height=72).write(tmp_path / "scene")
+    run = make_run(Scene.open(folder), tmp_path / "run")
+    render_all(run, tmp_path / "render", budget=1.0)
+    page = export_page(run, tmp_path / "sent" / "scene.html")
+    assert page.read_text().count('.mp4" type="text/plain">') == 2  # HEVC, and AV1
+    plain_tab.goto(page.as_uri(), 500, 300)
     plain_tab.click("#clip-button")
     plain_tab.wait("document.getElementById('clip-video').currentTime > 0.1")
-    assert plain_tab.run("document.getElementById('clip-video').videoWidth") == 704
+    assert plain_tab.run("document.getElementById('clip-video').videoWidth") == 128
     plain_tab.press("Escape")
     plain_tab.wait("document.getElementById('clip-video').paused")
     assert plain_tab.problems() == []
@@ -181,7 +186,7 @@ def test_the_clip_inside_the_page_plays(plain_tab: Page, toy: Scene, tmp_path: P
 def test_a_clip_that_the_browser_cannot_play_can_be_saved(
     plain_tab: Page, toy: Scene, tmp_path: Path
 ) -> None:
-    page = make_page("Toy", to_bytes(scene_file(toy)), with_clip(), b"no video")
+    page = make_page("Toy", to_bytes(scene_file(toy)), with_clip(), {"toy_hlg.mp4": b"no video"})
     (tmp_path / "scene.html").write_text(page)
     plain_tab.goto((tmp_path / "scene.html").as_uri(), 500, 300)
     plain_tab.click("#clip-button")

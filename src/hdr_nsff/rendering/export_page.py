@@ -6,6 +6,7 @@ specifies what it holds.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import quote
 
@@ -26,8 +27,9 @@ PAGE, BARE = ".html", ".hdr4d"  # endings of the two kinds of files
 HEAD_BYTES = 4096  # of a file, in which its mark is
 # videos of `render` that a page without a GPU offers, if they are beside it
 HDR_CLIP = "HDR clip"
-MAX_CLIP_BYTES = 4_000_000  # of an HDR video inside a page (hand-chosen: easily sent)
-PLAYED_CODECS: tuple[Codec, ...] = ("hevc", "av1")  # by browsers; hevc by more of them in HDR
+MAX_CLIP_BYTES = 4_000_000  # of HDR videos inside a page (hand-chosen: easily sent)
+# in this order by browsers: hevc in HDR by more of them, av1 by more of them at all
+PLAYED_CODECS: tuple[Codec, ...] = ("hevc", "av1")
 VIDEOS = {"training": "Video", "bullet": "Bullet time", "slowmo": "Slow motion"}
 
 
@@ -52,13 +54,14 @@ def export_page(run: Run, path: Path) -> Path:
 def single_page(run: Run, folder: Path, title: str, data: bytes) -> str:
     """The page with the scene `data` inside, to be written into `folder`."""
     videos = find_videos(run, folder)
-    clip = find_hdr_clip(run, folder)
-    if clip is None:
-        return make_page(title, data, PageSettings(videos=videos))
-    if clip.stat().st_size <= MAX_CLIP_BYTES:
-        settings = PageSettings(videos, Link(clip.name, HDR_CLIP))
-        return make_page(title, data, settings, clip.read_bytes())
-    return make_page(title, data, PageSettings(videos, link_below(clip, folder, HDR_CLIP)))
+    clips = find_hdr_clips(run, folder)
+    held = clips_that_fit(clips)
+    links = [Link(clip.name, HDR_CLIP) for clip in held]
+    if clips and not held:
+        beside = link_below(clips[-1], folder, HDR_CLIP)
+        links = [] if beside is None else [beside]
+    inside = {clip.name: clip.read_bytes() for clip in held}
+    return make_page(title, data, PageSettings(videos, links), inside)
 
 
 def check_place(path: Path) -> None:
@@ -99,18 +102,33 @@ def link_below(video: Path, folder: Path, text: str) -> Link | None:
     return Link(quote(target.relative_to(base).as_posix()), text)
 
 
-def find_hdr_clip(run: Run, folder: Path) -> Path | None:
-    """The HDR video as filmed that `render` or `run` has made, if any.
+def find_hdr_clips(run: Run, folder: Path) -> list[Path]:
+    """The HDR video as filmed that `render` or `run` has made: one file per codec, in
+    the order of `PLAYED_CODECS`; empty without any.
 
     Those of the run come first, then what lies in `render` beside a page in `folder`.
     """
-    for place in (*render_folders(run.folder), folder / "render"):
-        for transfer in TRANSFERS:
-            for codec in PLAYED_CODECS:
-                video = hdr_path(place, "training", transfer, codec)
-                if video.is_file():
-                    return video
-    return None
+    places = (*render_folders(run.folder), folder / "render")
+    for transfer in TRANSFERS:
+        clips = []
+        for codec in PLAYED_CODECS:
+            paths = [hdr_path(place, "training", transfer, codec) for place in places]
+            clips += [path for path in paths if path.is_file()][:1]
+        if clips:
+            return clips
+    return []
+
+
+def clips_that_fit(clips: Sequence[Path]) -> list[Path]:
+    """Those of `clips` that fit into a page together; the last one is chosen first."""
+    chosen: list[Path] = []
+    left = MAX_CLIP_BYTES
+    for clip in reversed(clips):
+        size = clip.stat().st_size
+        if size <= left:
+            chosen.insert(0, clip)
+            left -= size
+    return chosen
 
 
 def is_ours(path: Path) -> bool:

@@ -17,7 +17,7 @@ from hdr_nsff.core.progress import say
 from hdr_nsff.fields.recording_field import RecordingField
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.geometry.paths import PathView
-from hdr_nsff.rendering.export_page import HDR_CLIP, VIDEOS, find_hdr_clip, run_scene
+from hdr_nsff.rendering.export_page import HDR_CLIP, VIDEOS, find_hdr_clips, run_scene
 from hdr_nsff.rendering.output import render_folders
 from hdr_nsff.rendering.row_bands import render_in_bands
 from hdr_nsff.rendering.served_picture import served_picture
@@ -57,23 +57,21 @@ class ServedRun:
             for name, text in VIDEOS.items()
             if f"{name}.mp4" in names
         ]
-        clip = self.hdr_clip()
-        link = None if clip is None else Link(names[clip.name], HDR_CLIP)
+        clips = [Link(names[clip.name], HDR_CLIP) for clip in self.hdr_clips()]
         records = isinstance(self.run.field, RecordingField)
-        settings = PageSettings(videos, link, server=True, records=records)
+        settings = PageSettings(videos, clips, server=True, records=records)
         return make_page(self.title, None, settings)
 
     def places(self) -> list[Path]:
         """Folders where the run's videos may be."""
         return render_folders(self.folder)
 
-    def hdr_clip(self) -> Path | None:
-        return find_hdr_clip(self.run, self.places()[-1].parent)
+    def hdr_clips(self) -> list[Path]:
+        return find_hdr_clips(self.run, self.places()[-1].parent)
 
     def videos(self) -> dict[str, Path]:
         found = [place / f"{name}.mp4" for name in VIDEOS for place in reversed(self.places())]
-        clip = self.hdr_clip()
-        found += [] if clip is None else [clip]
+        found += self.hdr_clips()
         return {f"/video/{file.name}": file for file in found if file.is_file()}
 
     def scene(self) -> bytes:

@@ -18,11 +18,13 @@ import numpy as np
 
 from hdr_nsff.core import notes
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.hdr_video import can_encode
+from hdr_nsff.core.hdr_video import can_encode, check_encoder
 from hdr_nsff.core.progress import say
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.geometry.paths import PathView
+from hdr_nsff.radiometry.hdr_footage import hdr_path
 from hdr_nsff.rendering.fingerprint import fingerprint
+from hdr_nsff.rendering.hdr_shots import TRANSFERS, write_hdr_videos
 from hdr_nsff.rendering.output import Output, Shot
 from hdr_nsff.rendering.set_pictures import write_pictures
 from hdr_nsff.rendering.shot_views import SHOTS, find_frame, plan_shot
@@ -91,6 +93,8 @@ def render_all(
             results["EXR sequence"] = out / "training"
             results |= write_pictures(run, out, shot, own)
         results |= name_results(out, shot, LABELS[shot.name], own, video)
+        if filmed:
+            results |= add_av1_clip(run, shot, out, own)
     return results
 
 
@@ -101,6 +105,31 @@ def with_hdr_clip(output: Output, shot: Shot) -> Output:
     if output.hdr_video or not can_encode(output.hdr_codec, width, height, shot.fps):
         return output
     return replace(output, hdr_video=("hlg",))
+
+
+def add_av1_clip(run: Run, shot: Shot, out: Path, output: Output) -> dict[str, Path]:
+    """Write the HDR video of the training path in AV1 too, if it is not there; by name.
+
+    It is for the viewer's page in browsers without HEVC. Where it cannot be encoded,
+    there is none; a sentence says so where the encoder is missing.
+    """
+    transfer = next((t for t in TRANSFERS if t in output.hdr_video), TRANSFERS[0])
+    path = hdr_path(out, shot.name, transfer, "av1")
+    camera = shot.views[0].camera
+    try:
+        check_encoder("av1")
+    except InputError as error:
+        say(f"no HDR clip in AV1, which more browsers play than HEVC: {error}")
+        return {}
+    if not can_encode("av1", camera.width // 2 * 2, camera.height // 2 * 2, shot.fps):
+        return {}
+    if not path.exists():
+        note = notes.read(out / shot.name / "sequence.json", notes.Sequence)
+        assert note is not None  # of the shot that was just rendered
+        pictures = [out / shot.name / f"{i:05d}.png" for i in range(len(shot.views))]
+        av1 = replace(output, hdr_video=(transfer,), hdr_codec="av1")
+        write_hdr_videos(run, shot, pictures, out, av1, note.display_exposure)
+    return {f"{LABELS[shot.name]}, {transfer}, AV1": path}
 
 
 def check_folder(out: Path) -> None:

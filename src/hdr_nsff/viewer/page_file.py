@@ -13,7 +13,7 @@ import gzip
 import html
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -34,7 +34,7 @@ POLICY = (
 
 @dataclass(frozen=True)
 class Link:
-    """A file beside the page."""
+    """A file beside the page, or one that the page holds under this name."""
 
     href: str  # relative to the page
     text: str
@@ -45,8 +45,10 @@ class PageSettings:
     """What the scripts know besides the scene."""
 
     videos: Sequence[Link] = field(default_factory=list)
-    hdr_clip: Link | None = None
-    """An HDR video, for screens whose browser draws no light above white."""
+    hdr_clips: Sequence[Link] = field(default_factory=list)
+    """An HDR video, for screens whose browser draws no light above white: in several
+    codecs, of which a browser takes the first that it plays.
+    """
     server: bool = False
     """The page comes from a server, which has the scene and renders frames."""
     records: bool = False
@@ -57,12 +59,15 @@ class PageSettings:
 
 
 def make_page(
-    title: str, scene: bytes | None, settings: PageSettings, hdr_clip: bytes | None = None
+    title: str,
+    scene: bytes | None,
+    settings: PageSettings,
+    videos: Mapping[str, bytes] | None = None,
 ) -> str:
     """The HTML of the page; `scene` are the bytes of a scene file.
 
-    Without them the page asks its server for `scene.hdr4d`. `hdr_clip` are the bytes of
-    the video that `settings` names.
+    Without them the page asks its server for `scene.hdr4d`. `videos` are files that the
+    page holds, by the `href` of their links in `settings`.
     """
     server = "'self'" if settings.server else "'none'"
     media = " 'self'" if settings.server else ""
@@ -70,7 +75,7 @@ def make_page(
         "POLICY": POLICY.format(server=server, media=media),
         "TITLE": html.escape(title),
         "STYLE": read("page.css"),
-        "SOURCES": "\n".join(sources(scene, settings, hdr_clip)),
+        "SOURCES": "\n".join(sources(scene, settings, videos or {})),
     }
     page = read("page.html")
     for name, text in parts.items():
@@ -78,9 +83,7 @@ def make_page(
     return page
 
 
-def sources(
-    scene: bytes | None, settings: PageSettings, hdr_clip: bytes | None = None
-) -> list[str]:
+def sources(scene: bytes | None, settings: PageSettings, videos: Mapping[str, bytes]) -> list[str]:
     """The script elements of the page, the one that runs last."""
     elements = [script("settings", "application/json", json.dumps(asdict(settings)))]
     elements += [script(name, "text/plain", read(name)) for name in SHADERS]
@@ -88,8 +91,8 @@ def sources(
     if scene is not None:
         packed = base64.b64encode(gzip.compress(scene, mtime=0)).decode()
         elements.append(script("scene", "text/plain", packed))
-    if hdr_clip is not None:
-        elements.append(script("clip-data", "text/plain", base64.b64encode(hdr_clip).decode()))
+    for name, video in videos.items():
+        elements.append(script(name, "text/plain", base64.b64encode(video).decode()))
     elements.append(f'<script type="module">\n{join_modules(ENTRY)}</script>')
     return elements
 

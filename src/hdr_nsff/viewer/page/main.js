@@ -124,20 +124,20 @@ async function followVersion(player, version) {
   }
 }
 
-function showVideos({ videos, hdr_clip: clip, server }) {
-  const data = held("clip-data");
-  const played = clip && (data || server); // here; else a file beside the page
-  for (const { href, text } of clip && !played ? [clip, ...videos] : videos) {
+function showVideos({ videos, hdr_clips: clips, server }) {
+  const files = clips.map((clip) => ({ ...clip, data: held(clip.href) }));
+  const played = files.length && (files[0].data || server); // else a file beside the page
+  for (const { href, text } of played ? videos : [...clips, ...videos]) {
     const link = document.createElement("a");
     Object.assign(link, { href, textContent: text, target: "_blank" });
     find("videos").append(link);
   }
-  if (played) offerClip(clip, data);
+  if (played) offerClip(files);
 }
 
 /** On an HDR screen: what shows the light that this page does not draw. */
-function explainRange({ hdr_clip: clip }) {
-  find("range-note").textContent = clip
+function explainRange({ hdr_clips: clips }) {
+  find("range-note").textContent = clips.length
     ? "Drawn here, light ends at white. The HDR clip shows it on this screen."
     : "Drawn here, light ends at white. For this screen, make an HDR clip: " +
       "hdr-nsff render RUN --path training --hdr-video hlg";
