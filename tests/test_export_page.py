@@ -99,6 +99,25 @@ def test_a_page_in_any_folder_holds_the_hdr_video_of_its_own_run(
     assert base64.b64encode(b"of another run").decode() not in page
 
 
+def test_a_small_video_as_filmed_is_inside_the_page(
+    toy: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = make_run(toy, tmp_path / "run")
+    (tmp_path / "render").mkdir()
+    for name in ("training", "bullet"):
+        (tmp_path / "render" / f"{name}.mp4").write_bytes(name.encode())
+    held = base64.b64encode(b"training").decode()
+    others = {"href": "render/bullet.mp4", "text": "Bullet time"}
+    for limit, href in ((8, "training.mp4"), (7, "render/training.mp4")):
+        monkeypatch.setattr("hdr_nsff.rendering.export_page.MAX_VIDEO_BYTES", limit)
+        page = export_page(run, tmp_path / "scene.html").read_text()
+        links = [{"href": href, "text": "Video"}, others]
+        assert f'"videos": {json.dumps(links)}' in page
+        assert (f'<script id="training.mp4" type="text/plain">{held}</script>' in page) == (
+            limit == 8
+        )
+
+
 @pytest.mark.parametrize("options", [{"ply": True}, {"time": 1.0}, {"layout": "nerfstudio"}])
 def test_options_that_a_page_has_no_use_for_are_refused(options: dict) -> None:
     with pytest.raises(InputError, match="a page"):

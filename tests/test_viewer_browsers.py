@@ -6,10 +6,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from browser import Page, find_browser
+from test_export_gaussians import make_run
 from viewer_scenes import scene_file
 
+from hdr_nsff.core.video import write_video
+from hdr_nsff.rendering.export_page import export_page
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.viewer.page_file import Link, PageSettings, make_page
 from hdr_nsff.viewer.scene_file import to_bytes
@@ -29,7 +33,8 @@ SLOW = """viewer.renderer.composite = (draw => function (...view) {
   return draw.apply(this, view);
 })(viewer.renderer.composite)"""
 NOTE = "document.getElementById('note').textContent"
-ADVICE = "The videos below the settings play smoothly."
+ADVICE = "The videos below the settings play smoothly. They lie in render/ beside this page."
+INSIDE = "“Video” below the settings plays smoothly. The others lie in render/ beside this page."
 
 
 @pytest.fixture
@@ -68,3 +73,43 @@ def test_a_browser_without_webgl_2_names_the_videos(tab: Page, address: str) -> 
     assert tab.run("document.querySelector('#videos a').getAttribute('href')") == (
         "render/training.mp4"
     )
+
+
+def test_a_page_that_was_sent_plays_the_video_inside_it(
+    tab: Page, toy: Scene, tmp_path: Path
+) -> None:
+    run = make_run(toy, tmp_path / "run")
+    (tmp_path / "render").mkdir()
+    write_video(tmp_path / "render/training.mp4", [np.zeros((36, 64, 3))] * 12, 12)
+    (tmp_path / "render/slowmo.mp4").write_bytes(b"")
+    page = export_page(run, tmp_path / "scene.html")
+    (tmp_path / "sent").mkdir()
+    page = page.rename(tmp_path / "sent/scene.html")
+    with tab.prepared(NO_WEBGL), pytest.raises(RuntimeError, match="no WebGL 2") as failed:
+        tab.goto(page.as_uri(), 500, 300)
+    assert INSIDE in str(failed.value)
+    assert tab.run("document.querySelector('#videos > *').textContent") == "Video"
+    assert tab.run("document.querySelector('#videos a').textContent") == "Slow motion"
+    tab.click("#video-button")
+    tab.wait("document.getElementById('clip-video').currentTime > 0.1")
+    assert tab.run("document.getElementById('clip').ariaLabel") == "Video"
+    assert all(asked.startswith(page.as_uri()) for asked in tab.requests())
+
+
+def test_one_dialog_plays_the_video_of_the_button(tab: Page, toy: Scene, tmp_path: Path) -> None:
+    files = {"toy_hlg.mp4": b"no video", "training.mp4": b""}
+    for name, side in (("toy_hlg_av1.mp4", 72), ("training.mp4", 36)):
+        write_video(tmp_path / name, [np.zeros((side, 64, 3))] * 12, 12)
+        files[name] = (tmp_path / name).read_bytes()
+    clips = [Link(f"toy_hlg{ending}.mp4", "HDR clip") for ending in ("", "_av1")]
+    settings = PageSettings([Link("training.mp4", "Video")], clips)
+    (tmp_path / "scene.html").write_text(
+        make_page("Toy", to_bytes(scene_file(toy)), settings, files)
+    )
+    tab.goto((tmp_path / "scene.html").as_uri(), 500, 300)
+    for button, height in (("clip", 72), ("video", 36), ("clip", 72), ("clip", 72)):
+        tab.click(f"#{button}-button")
+        tab.wait(f"document.getElementById('clip-video').videoHeight === {height}")
+        tab.wait("document.getElementById('clip-video').currentTime > 0.1")
+        tab.press("Escape")
+        tab.wait("document.getElementById('clip-video').paused")

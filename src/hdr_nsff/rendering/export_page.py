@@ -25,11 +25,12 @@ from hdr_nsff.viewer.scene_file import KEY, SceneFile, to_bytes
 
 PAGE, BARE = ".html", ".hdr4d"  # endings of the two kinds of files
 HEAD_BYTES = 4096  # of a file, in which its mark is
-# videos of `render` that a page without a GPU offers, if they are beside it
 HDR_CLIP = "HDR clip"
 MAX_CLIP_BYTES = 4_000_000  # of HDR videos inside a page (hand-chosen: easily sent)
+MAX_VIDEO_BYTES = 4_000_000  # of the 8-bit video inside a page (hand-chosen likewise)
 # in this order by browsers: hevc in HDR by more of them, av1 by more of them at all
 PLAYED_CODECS: tuple[Codec, ...] = ("hevc", "av1")
+# videos of `render` that a page offers: the first inside it, the others beside it
 VIDEOS = {"training": "Video", "bullet": "Bullet time", "slowmo": "Slow motion"}
 
 
@@ -53,14 +54,19 @@ def export_page(run: Run, path: Path) -> Path:
 
 def single_page(run: Run, folder: Path, title: str, data: bytes) -> str:
     """The page with the scene `data` inside, to be written into `folder`."""
-    videos = find_videos(run, folder)
     clips = find_hdr_clips(run, folder)
     held = clips_that_fit(clips)
     links = [Link(clip.name, HDR_CLIP) for clip in held]
     if clips and not held:
         beside = link_below(clips[-1], folder, HDR_CLIP)
         links = [] if beside is None else [beside]
-    inside = {clip.name: clip.read_bytes() for clip in held}
+    videos = find_videos(run, folder)
+    filmed = find_filmed(run, folder)
+    if filmed is not None:
+        own = Link(filmed.name, VIDEOS["training"])
+        videos = [own, *(link for link in videos if link.text != own.text)]
+        held.append(filmed)
+    inside = {video.name: video.read_bytes() for video in held}
     return make_page(title, data, PageSettings(videos, links), inside)
 
 
@@ -82,11 +88,25 @@ def run_title(folder: Path) -> str:
     return place.parent.name if place.name == "run" else place.name
 
 
+def places(run: Run, folder: Path) -> tuple[Path, ...]:
+    """Where videos of a page in `folder` may be: of the run, then beside the page."""
+    return (*render_folders(run.folder), folder / "render")
+
+
+def find_filmed(run: Run, folder: Path) -> Path | None:
+    """The 8-bit video as filmed, if there is one that is small enough for a page."""
+    for place in places(run, folder):
+        video = place / "training.mp4"
+        if video.is_file():
+            return video if video.stat().st_size <= MAX_VIDEO_BYTES else None
+    return None
+
+
 def find_videos(run: Run, folder: Path) -> list[Link]:
     """Videos of `render` that lie below `folder`, as links from it."""
     links = []
     for name, text in VIDEOS.items():
-        for place in (folder / "render", run.folder / "render"):
+        for place in places(run, folder):
             link = link_below(place / f"{name}.mp4", folder, text)
             if link is not None:
                 links.append(link)
@@ -105,14 +125,11 @@ def link_below(video: Path, folder: Path, text: str) -> Link | None:
 def find_hdr_clips(run: Run, folder: Path) -> list[Path]:
     """The HDR video as filmed that `render` or `run` has made: one file per codec, in
     the order of `PLAYED_CODECS`; empty without any.
-
-    Those of the run come first, then what lies in `render` beside a page in `folder`.
     """
-    places = (*render_folders(run.folder), folder / "render")
     for transfer in TRANSFERS:
         clips = []
         for codec in PLAYED_CODECS:
-            paths = [hdr_path(place, "training", transfer, codec) for place in places]
+            paths = [hdr_path(place, "training", transfer, codec) for place in places(run, folder)]
             clips += [path for path in paths if path.is_file()][:1]
         if clips:
             return clips

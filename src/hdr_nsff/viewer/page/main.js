@@ -2,7 +2,7 @@
 
 import { readScene, unpack } from "./format.js";
 import { Renderer, driverName, openContext } from "./renderer.js";
-import { offerClip } from "./clip.js";
+import { offerVideo } from "./clip.js";
 import { hasHighRange, openHdrScreen } from "./hdr.js";
 import { Player } from "./player.js";
 import { Frames } from "./frames.js";
@@ -82,8 +82,23 @@ function helpSlowDrawing(player, settings) {
   player.advised = true;
 }
 
-function videoAdvice({ videos }) {
-  return videos.length ? " The videos below the settings play smoothly." : "";
+/** Which videos play smoothly: first the one inside the page, which is always there. */
+function videoAdvice({ videos, server }) {
+  if (!videos.length) return "";
+  const inside = videos.find(({ href }) => held(href));
+  const others = videos.filter((video) => video !== inside);
+  const first = inside
+    ? ` “${inside.text}” below the settings plays smoothly.`
+    : " The videos below the settings play smoothly.";
+  if (server || !others.length) return first;
+  return `${first} ${inside ? "The others" : "They"} lie ${placeOf(others)}.`;
+}
+
+/** Where files lie that a page links to. */
+function placeOf(links) {
+  const folders = new Set(links.map(({ href }) => decodeURIComponent(href.replace(/[^/]*$/, ""))));
+  const named = [...folders].filter(Boolean).join(", ");
+  return `${named && `in ${named} `}beside this page`;
 }
 
 function shaderSources() {
@@ -124,15 +139,23 @@ async function followVersion(player, version) {
   }
 }
 
+/** Buttons for videos that play here, and links to those that lie beside the page. */
 function showVideos({ videos, hdr_clips: clips, server }) {
   const files = clips.map((clip) => ({ ...clip, data: held(clip.href) }));
   const played = files.length && (files[0].data || server); // else a file beside the page
+  if (played) offerVideo("clip-button", files);
   for (const { href, text } of played ? videos : [...clips, ...videos]) {
-    const link = document.createElement("a");
-    Object.assign(link, { href, textContent: text, target: "_blank" });
-    find("videos").append(link);
+    const data = held(href);
+    if (data) offerVideo("video-button", [{ href, text, data }]);
+    else addLink(href, text, server);
   }
-  if (played) offerClip(files);
+}
+
+function addLink(href, text, server) {
+  const link = document.createElement("a");
+  const title = server ? "" : `Lies ${placeOf([{ href }])}`;
+  Object.assign(link, { href, textContent: text, target: "_blank", title });
+  find("videos").append(link);
 }
 
 /** On an HDR screen: what shows the light that this page does not draw. */
