@@ -11,7 +11,7 @@ try:
     import os
     import sys
     from collections.abc import Iterator, Sequence
-    from contextlib import contextmanager, nullcontext
+    from contextlib import AbstractContextManager, contextmanager, nullcontext
     from dataclasses import dataclass
     from functools import partial
     from importlib import import_module
@@ -184,7 +184,10 @@ def run_verb(name: str, verb: Verb, options: list[str]) -> None:
     with_viewer = name == "train" and VIEW in options
     try:
         settings = parse(name, config, [o for o in options if not (with_viewer and o == VIEW)])
-        viewer = load("hdr_nsff.view:viewer_beside")(settings.out) if with_viewer else nullcontext()
+        viewer: AbstractContextManager[None] = nullcontext()
+        if with_viewer:
+            settings = load("hdr_nsff.view:watched")(settings, options)
+            viewer = load("hdr_nsff.view:viewer_beside")(settings.out)
         with writing_to("output"), viewer:
             function(settings)
     except InputError as error:

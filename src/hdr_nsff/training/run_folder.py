@@ -113,6 +113,7 @@ def open_folder(config: TrainConfig) -> None:
     """Start a run folder, or check that an existing one has these settings and scene.
 
     The path of a scene that has moved is updated. An open budget is that of the run.
+    Device and time between checkpoints may be others.
     """
     out = config.out
     if (out / SCENE_FILE).exists():
@@ -120,7 +121,8 @@ def open_folder(config: TrainConfig) -> None:
     if (out / CONFIG).exists():
         before, places = stored_config(out)
         config = with_own_budget(config)
-        if replace(before, scene=config.scene, out=out, device=config.device) != config:
+        before = replace(before, scene=config.scene, out=out, device=config.device)
+        if replace(before, checkpoint_seconds=config.checkpoint_seconds) != config:
             raise InputError(
                 f"{out}: holds a run with other settings; "
                 "choose another --out, or delete it to start over"
