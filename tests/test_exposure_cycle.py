@@ -100,6 +100,14 @@ def test_steps_of_two_stops_measure_about_two_ev():
     assert np.allclose(detect_cycle(clip([-2, 0, 2])).ev, [0, 2, 4], atol=0.3)
 
 
+def test_auto_exposure_of_a_few_frames_is_no_cycle():
+    """Steps of eleven frames that happen to repeat after five, by 69 %."""
+    hunting = np.array([-1.4, -1.27, -0.2, 1.3, -0.12, -0.99, -0.95, -0.15, 1.31, 2.03])
+    assert cycle_of_steps(hunting).length == 1
+    cycle = np.array([-1.4, -1.27, -0.2, 1.3, 1.57] * 2)  # one that returns
+    assert cycle_of_steps(cycle).length == 5
+
+
 def test_ordinary_clips_have_no_cycle():
     assert detect_cycle(clip([0])).length == 1
     assert detect_cycle(clip([0], pan=3, flicker=0.1)).length == 1
