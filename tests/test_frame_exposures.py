@@ -57,6 +57,17 @@ def test_auto_exposure_is_found_where_no_cycle_is():
     assert "auto exposure" in describe(response, [None])
 
 
+def test_the_factor_of_dark_frames_is_less_certain():
+    """Where no point shows the mid-tones, whose steepness gives it."""
+    widths = []
+    for gain in (0.0, -5.0):
+        views = drifting_views(SRGB, smooth_drift(3.0) + gain, (1,))
+        response = estimate_response(views, [0] * NUM, [None], reference=0, num_cameras=1)
+        assert response.drift is not None
+        widths.append(np.log(response.scale_high / response.scale_low))
+    assert widths[1] > 1.5 * widths[0]
+
+
 def test_drift_on_top_of_alternation_is_found():
     drift = smooth_drift(1.0)
     views = drifting_views(S_CURVE, drift, (0, 2))

@@ -19,8 +19,14 @@ from hdr_nsff.radiometry.bracket_response import (
     bracket_response,
     problem_of,
 )
-from hdr_nsff.radiometry.bracketing import FACTORS, StepScale, likely_scale, measured_scale
-from hdr_nsff.radiometry.debevec import debevec
+from hdr_nsff.radiometry.bracketing import (
+    FACTORS,
+    BracketingTuning,
+    StepScale,
+    likely_scale,
+    measured_scale,
+)
+from hdr_nsff.radiometry.debevec import debevec, shows_mid_tones
 from hdr_nsff.radiometry.frame_exposures import (
     drift_is_shared,
     drift_within_brackets,
@@ -174,7 +180,11 @@ def with_drift(
     for bracket in np.unique(brackets):
         found[bracket] = level[brackets == bracket][0]
     found = found - found[reference]
-    scale = drift_scale(in_time, x, y, exposures, found, ev, tuning, lossless)
+    bracketing = tuning.debevec.bracketing
+    if not shows_mid_tones(readings.samples, tuning.debevec):
+        bracketing = bracketing.without_mid_tones()
+    likelihood = noise_of_frames(in_time, x, y, exposures, tuning) if lossless else None
+    scale = drift_scale(found, ev, likelihood, bracketing)
     in_order[ordered] = drift * scale.factor
     knots = np.linspace(0, 1, NUM_KNOTS) ** GAMMA
     curves = np.stack([np.interp(knots, x**scale.factor, channel) for channel in y])
@@ -196,36 +206,35 @@ def with_drift(
 
 
 def drift_scale(
-    views: Sequence[ResponseView],
-    x: np.ndarray,
-    y: np.ndarray,
-    exposures: np.ndarray,
     found: np.ndarray,
     ev: Sequence[float | None],
-    tuning: ResponseTuning,
-    lossless: bool,
+    log_likelihood: np.ndarray | None,
+    bracketing: BracketingTuning,
 ) -> StepScale:
-    """The common factor on the `exposures` (V,) of frames and the EVs `found` (B,) of
-    brackets: from known ones, else from noise, curve and usual steps.
+    """The common factor on the exposures of all frames and the EVs `found` (B,) of
+    brackets: from known ones, else from noise (the `log_likelihood` of every one of
+    `FACTORS`), curve and usual steps.
     """
     known = np.array([e is not None for e in ev])
     true = np.array([0.0 if e is None else e for e in ev])
     if np.abs(true[known]).max(initial=0.0) > 0:
         factor = float(true[known] @ found[known] / (found[known] @ found[known]))
         return StepScale(factor, factor, factor, factor)
-    log_likelihood = None
-    if lossless:
-        levels = np.round((exposures - exposures.min()) / LEVEL_EV).astype(int)
-        images = LazyList(lambda k: views[k].image, len(views))
-        log_likelihood = noise_log_likelihood(
-            images,
-            levels.tolist(),
-            x,
-            y,
-            exposures,
-            FACTORS,
-            tuning.noise,
-        )
     if len(found) == 1:
-        return measured_scale(log_likelihood, tuning.debevec.bracketing)
-    return likely_scale(found, None, log_likelihood, tuning.debevec.bracketing)
+        return measured_scale(log_likelihood, bracketing)
+    return likely_scale(found, None, log_likelihood, bracketing)
+
+
+def noise_of_frames(
+    views: Sequence[ResponseView],
+    x: np.ndarray,
+    y: np.ndarray,
+    exposures: np.ndarray,
+    tuning: ResponseTuning,
+) -> np.ndarray | None:
+    """The log likelihood of every one of `FACTORS` on the `exposures` (V,) of frames,
+    from the noise of their sensor; None where nothing follows.
+    """
+    levels = np.round((exposures - exposures.min()) / LEVEL_EV).astype(int)
+    images = LazyList(lambda k: views[k].image, len(views))
+    return noise_log_likelihood(images, levels.tolist(), x, y, exposures, FACTORS, tuning.noise)
