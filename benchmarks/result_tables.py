@@ -161,6 +161,27 @@ def of_one_program(
     return [whole[-1][place] for place in places]
 
 
+def bench_movers(document: Document) -> Lines:
+    """One line per clip, and their means: both methods, on movers too."""
+    runs = {(run["scene"], run["method"]): run["values"] for run in document["results"]}
+    keys = ("psnr", "psnr_moving", "stability.hdr_tae_moving")
+    scenes = list(dict.fromkeys(scene for scene, _ in runs))
+    methods = list(dict.fromkeys(method for _, method in runs))
+    for method in methods:
+        of_all = [runs[scene, method] for scene in scenes]
+        means = {key: sum(values[key] for values in of_all) / len(of_all) for key in keys}
+        runs["mean", method] = means
+    rows = []
+    for scene in [*scenes, "mean"]:
+        row = [scene if scene == "mean" else f"`{scene}`"]
+        for method in methods:
+            values = runs[scene, method]
+            row += [pair(values, *keys[:2]), number(values[keys[2]], 3)]
+        rows.append(row)
+    heads = [head for method in methods for head in (f"`{method}`", "HDR-TAE of movers")]
+    return table(["clip", *heads], rows)
+
+
 def bench_rig(document: Document) -> Lines:
     """One line per scene: by estimated priors, by given ones, and between them."""
     found = {run["scene"]: run["values"] for run in document["results"]}

@@ -23,6 +23,7 @@ from result_tables import (
     bench_clips,
     bench_convergence,
     bench_lenses,
+    bench_movers,
     bench_rig,
     bench_rise,
     bench_scores,
@@ -145,6 +146,15 @@ SECTIONS = (
         "hdr-nsff bench OUT --scenes CLIP,CLIP,... --methods splat --steps 800 --max-size 320 "
         "--views 0` and `--methods splat,grid --budget 2min --views 0 --jobs 2",
         bench_clips,
+    ),
+    Section(
+        "bench-movers",
+        "People, with and without time-local Gaussians",
+        "The same clips and scenes with rigid movers alone: people then come out as ghosts. "
+        "HDR-TAE, the flicker along the flow, does not tell: a ghost hardly flickers.",
+        'hdr-nsff bench OUT --scenes CLIP,... --methods "splat,rigid-only=splat --set '
+        'field.local=0" --steps 800 --views 0',
+        bench_movers,
     ),
     Section(
         "exposure_cycles",

@@ -48,6 +48,7 @@ SCORES = (
     Column("mu5000_recordable", "recordable", 2, 1),
     Column("pu21", "PU21", 2, 1),
     Column("hdr_flip", "HDR-FLIP", 3, -1),
+    Column("stability.hdr_tae_moving", "HDR-TAE of movers", 3, -1),
     Column("camera.response_rmse", "response RMSE", 4, -1),
     Column("camera.largest_step_error", "error of EV steps", 3, -1),
 )
@@ -78,6 +79,7 @@ class Row:
         if self.metrics is None or self.record is None or self.record.trained is None:
             return {}
         found = numbers_of(self.metrics["headline"], "")
+        found |= numbers_of(self.metrics.get("stability") or {}, "stability.")
         found |= numbers_of(self.metrics.get("camera", {}), "camera.")
         found |= numbers_of(self.metrics.get("poses", {}), "poses.")
         found |= costs_of(self.record.trained)
