@@ -60,15 +60,17 @@ def test_columns_of_a_portrait_are_rows_of_the_sensor() -> None:
     assert found is not None and found[0] == pytest.approx(0.5, abs=0.04)
 
 
-def test_a_steady_pan_does_not_determine_it() -> None:
+def steady_pan(step: tuple[float, float]) -> list[PairMatches]:
+    """Noisy matches of a picture that moves by one step in every frame."""
     places = np.random.default_rng(0).uniform(0, W, (200, 2))
     rng = np.random.default_rng(1)
-    step = np.array([3.0, 0.0])
-    pan = [
-        PairMatches(t, t + 1, places, places + step + rng.normal(0, 0.2, places.shape))
-        for t in range(40)
-    ]
-    assert measure_readout(pan, (H, W)) is None
+    moved = places + np.array(step)
+    noise = rng.normal(0, 0.2, (FRAMES, *places.shape))
+    return [PairMatches(t, t + 1, places, moved + noise[t]) for t in range(FRAMES)]
+
+
+def test_a_steady_pan_does_not_determine_it() -> None:
+    assert measure_readout(steady_pan((3, 0)), (H, W)) is None
 
 
 def true_shake(seed: int = 0, amplitude: float = 6.0) -> tuple[float, float]:
@@ -89,13 +91,7 @@ def test_shake_is_the_acceleration_of_the_picture() -> None:
 
 
 def test_a_steady_pan_does_not_shake() -> None:
-    places = np.random.default_rng(0).uniform(0, W, (200, 2))
-    rng = np.random.default_rng(1)
-    step = np.array([3.0, 1.0])
-    pan = [
-        PairMatches(t, t + 1, places, places + step + rng.normal(0, 0.2, places.shape))
-        for t in range(40)
-    ]
+    pan = steady_pan((3, 1))
     found = measure_shake(affine_motions(pan, (H, W)))
     assert found is not None
     assert found[0] < 0.03 and found[1] == pytest.approx(np.hypot(3, 1), abs=0.05)
