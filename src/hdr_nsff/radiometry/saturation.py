@@ -47,8 +47,8 @@ def saturation(
             levels[c] = max(separation(saturated, unsaturated, candidates), lowest + 1e-3)
     rises = levels[:, None] - (basis(shown) @ curves.T).T  # (3 curves, 3 starts)
     followed = np.diag(basis(shown) @ curves.T) + np.median(rises, axis=0)
-    lowest_of = log_exposures(np.array([HIGH]), curves, shown)[:, 0]
-    return Top(np.where(shown < 1, np.maximum(followed, lowest_of), levels), shown)
+    highest = log_exposures(np.array([HIGH]), curves, shown)[:, 0]
+    return Top(np.where(shown < 1, np.maximum(followed, highest), levels), shown)
 
 
 def own_tops(curves: np.ndarray, top: Top) -> Top:
