@@ -68,6 +68,30 @@ def test_the_factor_of_dark_frames_is_less_certain():
     assert widths[1] > 1.5 * widths[0]
 
 
+def test_frames_that_show_nothing_are_bridged():
+    """A white frame has no points; its exposure lies between those beside it."""
+    drift = smooth_drift(3.0)
+    views = drifting_views(SRGB, drift, (1,))
+    for t in (7, 15):
+        views[t] = replace(views[t], image=np.ones_like(views[t].image))
+    response = estimate_response(views, [0] * NUM, [None], reference=0, num_cameras=1)
+    assert response.drift is not None and not response.problem
+    scale = response.drift @ (drift - drift.mean()) / (response.drift @ response.drift)
+    error = np.abs(scale * response.drift - drift + drift.mean())
+    assert np.median(error) < 0.05 and error.max() < 0.3
+
+
+def test_drift_that_too_few_frames_show_is_not_measured_and_that_is_said():
+    views = drifting_views(SRGB, smooth_drift(3.0), (1,))
+    for t in range(0, NUM, 3):
+        for k in (t, t + 1):
+            if k < NUM:
+                views[k] = replace(views[k], image=np.ones_like(views[k].image))
+    response = estimate_response(views, [0] * NUM, [None], reference=0, num_cameras=1)
+    assert response.drift is None
+    assert "exposed differently" in describe(response, [None])
+
+
 def test_drift_on_top_of_alternation_is_found():
     drift = smooth_drift(1.0)
     views = drifting_views(S_CURVE, drift, (0, 2))

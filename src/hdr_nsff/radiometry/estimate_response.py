@@ -28,11 +28,12 @@ from hdr_nsff.radiometry.bracketing import (
 )
 from hdr_nsff.radiometry.debevec import debevec, shows_mid_tones
 from hdr_nsff.radiometry.frame_exposures import (
+    are_determined,
+    determined_frames,
     drift_is_shared,
     drift_within_brackets,
     fit_curve_and_exposures,
     frame_log_exposures,
-    is_determined,
     read_points,
 )
 from hdr_nsff.radiometry.moving_samples import FlowLinks
@@ -47,6 +48,7 @@ DRIFTING_SHARE = 0.95  # quantile of the frames that has to drift for any to cou
 MAX_CURVE_FACTOR = 1.5
 UNCHECKED = "too few static points to hold given exposures against the pixels"
 CHANGING_LIGHT = "light that changes in some brackets only is not taken for auto exposure"
+FEW_READINGS = "too few points show whether single frames are exposed differently"
 
 
 def estimate_response(
@@ -97,7 +99,7 @@ def with_given_drift(
     ordered = sorted(range(len(views)), key=lambda i: views[i].time)
     in_time = [views[i] for i in ordered]
     readings = read_points(in_time, np.random.default_rng(SEED), tuning.frames)
-    if not is_determined(readings, len(views), tuning.frames):
+    if not determined_frames(readings, len(views), tuning.frames).all():
         return replace(response, disagreement=UNCHECKED)
     exposures = np.array([float(ev[v.bracket] or 0.0) for v in in_time]) + drift[ordered]
     brackets = np.array([v.bracket for v in in_time])
@@ -157,8 +159,8 @@ def with_drift(
     in_time = [views[i] for i in ordered]
     brackets = np.array([v.bracket for v in in_time])
     readings = read_points(in_time, np.random.default_rng(SEED), tuning.frames)
-    if not is_determined(readings, len(views), tuning.frames):
-        return response
+    if not are_determined(readings, brackets, tuning.frames):
+        return response if response.problem else replace(response, problem=FEW_READINGS)
     exposures = frame_log_exposures(readings, response.x, response.y[0], brackets, tuning.frames)
     drift = drift_within_brackets(exposures, brackets)
     if np.quantile(np.abs(drift), DRIFTING_SHARE) < tuning.frames.min_drift:

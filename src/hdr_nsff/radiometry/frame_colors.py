@@ -20,10 +20,10 @@ from scipy.ndimage import gaussian_filter1d
 from hdr_nsff.radiometry.frame_exposures import (
     FrameExposuresTuning,
     Readings,
+    determined_frames,
     drift_is_shared,
     drift_within_brackets,
     frame_log_exposures,
-    is_determined,
     read_points,
 )
 from hdr_nsff.radiometry.static_samples import ResponseView
@@ -109,7 +109,7 @@ def determined_halves(
     return [
         pair
         for pair in pairs
-        if all(is_determined(half, num_frames, tuning.frames) for half in pair)
+        if all(determined_frames(half, num_frames, tuning.frames).all() for half in pair)
     ]
 
 

@@ -50,6 +50,9 @@ class FrameExposuresTuning:
     smoothness: float = 1e-3  # of second differences, share of the weight of a frame
     curve_rounds: int = 5  # of exposures and curve in turns
     min_readings: int = 30  # of a frame, for an exposure of its own
+    # share of the frames of every bracket that need so many: the exposures of others,
+    # nearly black or white, are smooth in time
+    min_determined: float = 0.5
     # stops: drift of less than this (95 % of the frames) is none
     min_drift: float = 0.15
     # of the drift's root mean square: by how much a frame may differ from the ones
@@ -98,14 +101,24 @@ def read_points(
     )
 
 
-def is_determined(
+def determined_frames(
     readings: Readings, num_frames: int, tuning: FrameExposuresTuning = FrameExposuresTuning()
-) -> bool:
-    """Whether every frame shares enough points with others."""
+) -> np.ndarray:
+    """Which frames (T,) share enough points with others."""
     valid = readings.samples.valid.all(-1)
     valid = valid & (valid.sum(1, keepdims=True) >= 2)
     counts = np.bincount(readings.frame[valid], minlength=num_frames)
-    return bool((counts >= tuning.min_readings).all())
+    return counts >= tuning.min_readings
+
+
+def are_determined(
+    readings: Readings,
+    brackets: np.ndarray,
+    tuning: FrameExposuresTuning = FrameExposuresTuning(),
+) -> bool:
+    """Whether enough frames of each of the `brackets` (T,) share points with others."""
+    enough = determined_frames(readings, len(brackets), tuning)
+    return all(enough[brackets == b].mean() >= tuning.min_determined for b in np.unique(brackets))
 
 
 def frame_log_exposures(

@@ -55,12 +55,13 @@ def describe_points(response: Response) -> str:
 
 def describe_one_exposure(response: Response) -> str:
     """Why a clip without brackets determines no response, and what it lacks."""
+    why = response.problem
     if response.drift is None:
-        return (
+        text = (
             "a single exposure does not determine the response; "
             "light beyond its white is not recorded"
         )
-    why = response.problem
+        return f"{text}; {why}" if why else text
     if not why:
         span = np.ptp(response.drift)
         why = f"exposures within {span:.2f} stops do not determine the response"
