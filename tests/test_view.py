@@ -135,7 +135,7 @@ def test_versions_are_served_while_a_run_trains_and_after_its_end(
     )
     assert process.stderr is not None
     lines: list[str] = []
-    Thread(target=lambda: lines.extend(process.stderr), daemon=True).start()  # type: ignore[arg-type]
+    Thread(target=lines.extend, args=(process.stderr,), daemon=True).start()
     versions = []
     while process.poll() is None:
         address = re.search(r"http://127\.0\.0\.1:\d+/", "".join(lines))

@@ -282,3 +282,8 @@ def points_txt(file: BinaryIO) -> list[PointRow]:
             track_length = (len(words) - 8) // 2
             rows.append((int(words[0]), x, y, z, float(words[7]), track_length))
     return rows
+
+
+def views_of_images(model: ColmapModel) -> dict[int, ColmapImage]:
+    """The registered image of each view, whose number is in its file name."""
+    return {int(image.name[:5]): image for image in model.images.values()}

@@ -1,13 +1,11 @@
 """The camera's response from static points seen in several exposures (Debevec and Malik
 1997), before anything is trained.
 
-Unknown is G = ln g^-1, the log exposure of a recorded value z. The paper keeps G itself
-smooth. We write G(z) = a ln z + b ln srgb^-1(z) + H(z) and keep H smooth: the darks
-then fall back on a gamma curve, not on a straight line. H is linear between nodes even
-in asin(sqrt(z)), dense at both ends, so that a saturating shoulder is smooth in it.
-Every channel has its own G, the exposures are common. One linear least squares problem
-is solved and reweighted a few times, against points that moved, were hidden or fell
-into shadow.
+Unknown is G, the log exposure of a recorded value (`log_curve.py`). The paper keeps G
+itself smooth. We keep its part H smooth: the darks then fall back on a gamma curve, not
+on a straight line. Every channel has its own G, the exposures are common. One linear
+least squares problem is solved and reweighted a few times, against points that moved,
+were hidden or fell into shadow.
 
 With no exposure known, the recordings determine G and the log exposures only up to one
 common factor: E^p explains them as well as E (Grossberg and Nayar 2003). That factor is

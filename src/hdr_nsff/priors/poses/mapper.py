@@ -14,7 +14,7 @@ import torch
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.progress import say
-from hdr_nsff.footage.colmap import ColmapModel
+from hdr_nsff.footage.colmap import ColmapModel, views_of_images
 from hdr_nsff.geometry.lens import Lens
 from hdr_nsff.geometry.poses import Poses
 from hdr_nsff.priors.poses.lens import (
@@ -33,7 +33,6 @@ from hdr_nsff.priors.poses.reconstruct import (
     SfmViews,
     best_model,
     median_error,
-    views_of_images,
 )
 from hdr_nsff.priors.poses.rolling_shutter import best_readout
 from hdr_nsff.priors.poses.sfm import LENS_FILE

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hdr_nsff.core.errors import NoSceneError
-from hdr_nsff.footage.colmap import ColmapModel
+from hdr_nsff.footage.colmap import ColmapModel, views_of_images
 from hdr_nsff.geometry.pinhole import intrinsics
 from hdr_nsff.geometry.poses import (
     ADVICE,
@@ -23,7 +23,7 @@ from hdr_nsff.geometry.poses import (
     project,
     trusted_points,
 )
-from hdr_nsff.priors.poses.reconstruct import ReconstructionTuning, SfmViews, views_of_images
+from hdr_nsff.priors.poses.reconstruct import ReconstructionTuning, SfmViews
 
 
 def poses_from_model(

@@ -27,7 +27,7 @@ from hdr_nsff.core.process import usable_cores
 from hdr_nsff.core.progress import say
 from hdr_nsff.core.stack import ArrayStack, Stack, spread_frames
 from hdr_nsff.core.tensors import CPU
-from hdr_nsff.footage.colmap import ColmapImage, ColmapModel, read_model
+from hdr_nsff.footage.colmap import ColmapModel, read_model, views_of_images
 from hdr_nsff.geometry.lens import Lens
 from hdr_nsff.geometry.poses import ADVICE, MIN_REGISTERED_SHARE, RIG_ADVICE, format_ranges
 from hdr_nsff.priors.poses import sfm
@@ -446,8 +446,3 @@ def failure_message(
         f"poses failed: {len(missing)} of {count} frames could not be registered "
         f"(frames {format_ranges(missing)}); {advice}"
     )
-
-
-def views_of_images(model: ColmapModel) -> dict[int, ColmapImage]:
-    """The registered image of each view, whose number is in its file name."""
-    return {int(image.name[:5]): image for image in model.images.values()}
