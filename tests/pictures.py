@@ -5,10 +5,12 @@ from dataclasses import replace
 
 import pytest
 import torch
+from moments import random_field
 from torch import Tensor
 
 from hdr_nsff.fields.base import Render, Warp
 from hdr_nsff.fields.splat import draw
+from hdr_nsff.fields.splat.late_mixing import LateMixing, Parts
 from hdr_nsff.fields.splat.rasterize import Maps
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.geometry.cameras import Camera
@@ -126,3 +128,31 @@ def compare_composites(
         found.append([*(v.detach() for v in values), *gradients])
     for a, b in zip(*found, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5 * float(b.abs().max()))
+
+
+def compare_mixing(composite: Callable[..., tuple[Render, Tensor]], with_flow: bool) -> None:
+    """What is recorded late, and its share, by kernels and by plain torch.
+
+    `composite` takes a field, drawn maps, what is recorded of the background with the
+    share of late mixing, and whether the maps hold flow.
+    """
+    first = 6 if with_flow else 4
+    field, generator = random_field(), torch.Generator().manual_seed(2)
+
+    def plain(planes: Tensor, depth: Tensor, alpha: Tensor, behind: Tensor, s: Tensor) -> Tensor:
+        mixing = LateMixing()
+        del mixing.share
+        mixing.share = s
+        render, extra = draw.composite(field.model(), Maps(planes.permute(1, 2, 0), depth, alpha))
+        parts = Parts(extra, behind[None])
+        late, share = mixing(parts, extra[:, first - 4 :], render)
+        return torch.cat([render.radiance, late, share], 1)
+
+    def ours(planes: Tensor, depth: Tensor, alpha: Tensor, behind: Tensor, s: Tensor) -> Tensor:
+        render, flow = composite(field, [planes, depth, alpha], (behind, s), with_flow)
+        assert render.late is not None and render.late_share is not None
+        assert flow.shape == (len(render.late) if with_flow else 0, 2)
+        return torch.cat([render.radiance, render.late, render.late_share], 1)
+
+    behind, share = torch.rand(3, generator=generator), torch.tensor([0.3])
+    compare(ours, plain, *drawn_maps(first + 3), behind, share)

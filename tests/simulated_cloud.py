@@ -8,16 +8,10 @@ from typing import Any
 import pytest
 import torch
 from moments import MOMENTS, THERE, compare, field_of_times, random_field
-from pictures import compare_composites
 from test_splat import TIMES, scattered
-from torch import Tensor
 
-from hdr_nsff.fields.base import Render
 from hdr_nsff.fields.splat import draw, local_gaussians
 from hdr_nsff.fields.splat.fused_cloud import fused_cloud
-from hdr_nsff.fields.splat.fused_picture import fused_composite
-from hdr_nsff.fields.splat.rasterize import Maps
-from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.fields.splat.trajectories import weights_of_differences
 
 
@@ -45,17 +39,6 @@ def test_poses_are_smooth_in_time_where_frames_are_missing() -> None:
 def test_short_clips(num_times: int) -> None:
     compare(fused_cloud, field_of_times(num_times), float(num_times - 1), -1)
     compare(fused_cloud, field_of_times(num_times), 0.0, None)
-
-
-@pytest.mark.parametrize("radiance", ["exp", "sigmoid"])
-@pytest.mark.parametrize("channels", [4, 6])
-def test_maps_over_the_background(radiance: str, channels: int) -> None:
-    def ours(field: Splat, drawn: list[Tensor]) -> tuple[Render, Tensor]:
-        maps = Maps(drawn[0].permute(1, 2, 0), drawn[1], drawn[2])
-        numbers = field.bounded, field.far, draw.MIN_DEPTH_SHARE, draw.MIN_ALPHA
-        return fused_composite(maps, field.background, *numbers)
-
-    compare_composites(ours, random_field(radiance=radiance), channels)
 
 
 def test_more_gaussians_than_a_block() -> None:

@@ -22,6 +22,7 @@ from hdr_nsff.fields.nsff import encodings, fused_grid
 from hdr_nsff.fields.splat import (
     draw,
     fused_cloud,
+    fused_parts,
     fused_picture,
     local_gaussians,
     rasterize_cuda,
@@ -30,7 +31,7 @@ from hdr_nsff.fields.splat import (
 from hdr_nsff.fields.splat.rasterize import Maps, Planes, composite_view
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.scene import Scene
-from hdr_nsff.tonemap import bracketed, curve, fused_tone, kernel_cuda, vignetting
+from hdr_nsff.tonemap import bracketed, curve, fused_tone, photograph_cuda
 from hdr_nsff.training import fused_losses, weighted_terms
 from hdr_nsff.training.run_folder import open_folder
 from hdr_nsff.training.train import Trainer
@@ -38,10 +39,11 @@ from hdr_nsff.training.train import Trainer
 WITH_LAUNCHES = (
     rasterize_cuda,
     fused_cloud,
+    fused_parts,
     fused_picture,
     fused_grid,
     encodings,
-    kernel_cuda,
+    photograph_cuda,
     fused_losses,
     fused_tone,
     local_gaussians,
@@ -119,14 +121,14 @@ def device(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
     """The pretend device, on which our kernels run."""
     launch_by(monkeypatch, launch_there)
     use_few_knots(monkeypatch)
-    for module in (fused_picture, kernel_cuda, fused_losses):
+    for module in (fused_parts, fused_picture, photograph_cuda, fused_losses):
         monkeypatch.setattr(module, "MAX_BLOCKS", 2)
     for module in (draw, training_view):
         monkeypatch.setattr(module, "rasterize", draw_nothing)
     monkeypatch.setattr(training_view, "rasterize_planes", draw_no_planes)
     objectives = (fused_losses, weighted_terms)
     fields = training_view, local_gaussians, encodings
-    for module in (*fields, curve, vignetting, bracketed, *objectives):
+    for module in (*fields, curve, bracketed, *objectives):
         monkeypatch.setattr(module, "kernels_on", lambda device: device.type == "pretend")
     with pretend_device() as found:
         yield found

@@ -17,6 +17,39 @@ from hdr_nsff.scene.scene import Frame, Scene
 
 
 @dataclass(frozen=True)
+class Sensor:
+    """How a camera records one frame, in numbers, as CUDA kernels take them."""
+
+    gain: Tensor  # (3,) of the frame
+    curve: Tensor  # (3, K) response at the knots
+    knots: Tensor  # (K,)
+    leak: float | None  # of eq. 11; None clamps
+    # coefficients (C, 3) of every camera's lens, and the squared tangents (C,) at their
+    # corners; (0, 3) and (0,) where lenses pass all light
+    vignetting: Tensor
+    corners: Tensor
+    camera_id: int
+    least: float  # share of light that a lens passes at least
+
+    @staticmethod
+    def without_lens(gain: Tensor, curve: Tensor, knots: Tensor, leak: float | None) -> Sensor:
+        """Gain, curve and ends alone."""
+        nothing = knots[:0]
+        return Sensor(gain, curve, knots, leak, nothing.expand(3, -1).T, nothing, 0, 0.0)
+
+    def learned(self) -> tuple[Tensor, Tensor, Tensor]:
+        """What gets gradients."""
+        return self.gain, self.curve, self.vignetting
+
+    def numbers(self) -> tuple[Tensor | float, ...]:
+        """All, as the kernels take them one after another."""
+        tensors = self.gain, self.curve, self.knots, self.vignetting, self.corners
+        ends = int(self.leak is not None), float(self.leak or 0)
+        given = (t.detach().contiguous() for t in tensors)
+        return *given, *ends, self.camera_id, float(self.least)
+
+
+@dataclass(frozen=True)
 class Recorder:
     """One recording, for fields that need it before samples are composited."""
 
@@ -26,6 +59,7 @@ class Recorder:
     images: tuple[int, ...]
     # what a lens passes of radiance (M, 3), in a camera, at pixels (M, 2); None: all
     shade: Callable[[Tensor, Camera, Tensor], Tensor] | None = None
+    sensor: Sensor | None = None  # the same, for CUDA kernels in training
 
 
 @dataclass(frozen=True)

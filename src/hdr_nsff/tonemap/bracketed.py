@@ -5,22 +5,26 @@ default, whose curve is learned; `fixed`, gamma 2.2; `mlp`, HDR-NeRF's network.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from hdr_nsff.fields.base import Render
 from hdr_nsff.fields.splat.cuda_backends import kernels_on
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.radiometry.response import Response
+from hdr_nsff.scene.batch import PixelBatch, Recorder, Sensor
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap import curve
 from hdr_nsff.tonemap.base import LN2, Recordings, ToneMapConfig, ToneMapper, drift_of
 from hdr_nsff.tonemap.curve import GAMMA
 from hdr_nsff.tonemap.fused_tone import Held, Learned, Recording, fused_recording
 from hdr_nsff.tonemap.kernel import bin_table
+from hdr_nsff.tonemap.photograph_cuda import photograph
 from hdr_nsff.tonemap.responses import NetworkResponse, SharedResponse
-from hdr_nsff.tonemap.vignetting import Vignetting
+from hdr_nsff.tonemap.vignetting import MIN_TRANSMISSION, Vignetting
 from hdr_nsff.tonemap.vignetting_start import start_vignetting
 
 
@@ -202,6 +206,36 @@ class SharedToneMapper(BracketedToneMapper):
         leak = self.config.leak if leaky else None
         given = self.knots, self.bins, self.power, leak
         return curve.record(radiance.float(), recording.gain, recording.curve, *given)
+
+    def recorder(
+        self, bracket: int, camera_id: int, frame: int | None = None, leaky: bool = False
+    ) -> Recorder:
+        """One recording; in training, kernels take it in numbers."""
+        recorder = super().recorder(bracket, camera_id, frame, leaky)
+        if not leaky or not kernels_on(self.knots.device):
+            return recorder
+        recording = self.recording(bracket, camera_id, frame)
+        self.unread_terms = recording.terms
+        given = recording.gain, recording.curve, self.knots, self.config.leak
+        sensor = Sensor.without_lens(*given)
+        if self.vignetting is not None:
+            sensor = replace(
+                sensor,
+                vignetting=self.vignetting.coefficients,
+                corners=self.vignetting.corners,
+                camera_id=camera_id,
+                least=MIN_TRANSMISSION,
+            )
+        return replace(recorder, sensor=sensor)
+
+    def record_render(self, render: Render, batch: PixelBatch, leaky: bool) -> Tensor:
+        sensor = None if batch.recorder is None else batch.recorder.sensor
+        if not leaky or sensor is None or render.rgb is not None or batch.camera.K.requires_grad:
+            return super().record_render(render, batch, leaky)
+        late = None
+        if render.late is not None and render.late_share is not None:
+            late = render.late, render.late_share
+        return photograph(render.radiance, sensor, batch.camera, batch.pixels, late)
 
     def recording(self, bracket: int, camera_id: int, frame: int | None) -> Recording:
         """What records a frame, by CUDA kernels."""

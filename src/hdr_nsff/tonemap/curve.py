@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from hdr_nsff.fields.splat.cuda_backends import kernels_on
+from hdr_nsff.scene.batch import Sensor
 from hdr_nsff.tonemap.kernel import Respond
-from hdr_nsff.tonemap.kernel_cuda import RespondCuda
+from hdr_nsff.tonemap.photograph_cuda import photograph
 
 NUM_KNOTS = 256
 GAMMA = 2.2
@@ -68,7 +69,7 @@ def record(
     if all(t.device.type == "cpu" and t.dtype == torch.float32 for t in inputs):
         return Respond.apply(radiance, gain, values, knots, bins, leak)
     if radiance.dtype == torch.float32 and kernels_on(radiance.device):
-        return RespondCuda.apply(radiance, gain, values, knots, leak)
+        return photograph(radiance, Sensor.without_lens(gain, values, knots, leak))
     x = radiance * gain
     y = piecewise_linear(x, values, knots, power)
     return y if leak is None else leaky_ends(x, y, leak)

@@ -14,10 +14,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from hdr_nsff.fields.splat.cuda_backends import kernels_on
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.scene import Frame, Scene
-from hdr_nsff.tonemap.kernel_cuda import ShadeCuda
 
 # standard deviation of r^2 over the frames that see a point, averaged over points:
 # below it a clip determines no vignetting (hand-chosen: real pans have 0.04 to 0.09,
@@ -45,11 +43,7 @@ class Vignetting(nn.Module):
 
     def shade(self, radiance: Tensor, camera: Camera, pixels: Tensor, camera_id: int) -> Tensor:
         """What of `radiance` (N, 3) a camera's lens passes to `pixels` (N, 2)."""
-        if camera.K.requires_grad or not kernels_on(radiance.device):
-            return radiance * self(camera, pixels, camera_id)
-        lens = camera.K, self.corners, camera_id, MIN_TRANSMISSION
-        shaded: Tensor = ShadeCuda.apply(radiance, self.coefficients, pixels, *lens)
-        return shaded
+        return radiance * self(camera, pixels, camera_id)
 
     def size(self) -> Tensor:
         """Mean square of the coefficients: how far from none."""

@@ -19,6 +19,8 @@ from hdr_nsff.fields.kernels.pixel import (
     background_radiance,
     compose_pixel,
     compose_pixel_gradients,
+    mix_pixel,
+    mix_pixel_gradients,
     pixel_loss_gradients,
     pixel_losses,
 )
@@ -65,43 +67,48 @@ def losses_backward(
 
 @jit(parallel=True, nogil=True, fastmath=FAST, error_model="numpy")
 def compose(
-    planes, alphas, background, bounded, far, least, least_alpha,
-    radiance, depth, motion, flow, late,
+    planes, alphas, background, behind, share, bounded, far, least, least_alpha,
+    radiance, depth, motion, flow, late, late_share,
 ):  # fmt: skip
-    """Fill the picture, z-depth, motion, flow (N or 0, 2) and what is recorded `late`
-    (N or 0, 3), of premultiplied `planes` (D, N): these in turn, z-depth last.
+    """Fill the picture, z-depth, motion, flow (N or 0, 2), and what is recorded `late`
+    (N or 0, 3) with its share, of premultiplied `planes` (D, N): these in turn, z-depth
+    last. `behind` (3,) and `share` (1,) are those of `pixel.mix_pixel`.
     """
     count, first = len(alphas), 6 if len(flow) else 4
     for k in numba.prange(CHUNKS):
         drawn, made = (planes, planes[-1], alphas), (radiance, depth, motion, flow)
-        behind, _ = background_radiance(background, bounded)
+        light, _ = background_radiance(background, bounded)
         for i in range(k * count // CHUNKS, (k + 1) * count // CHUNKS):
-            compose_pixel(i, drawn, behind, far, least, least_alpha, made)
+            compose_pixel(i, drawn, light, far, least, least_alpha, made)
             if len(late):
-                for c in range(3):
-                    late[i, c] = planes[first + c, i]
+                mix_pixel(i, drawn, first, behind, share, late, late_share)
 
 
 @jit(parallel=True, nogil=True, fastmath=FAST, error_model="numpy")
 def compose_backward(
-    planes, alphas, background, bounded, least, least_alpha,
-    d_radiance, d_depth, d_motion, d_flow, d_late, g_planes, g_alphas, g_background,
+    planes, alphas, background, behind, bounded, least, least_alpha,
+    d_radiance, d_depth, d_motion, d_flow, d_late, d_late_share, g_planes, g_alphas, sums,
 ):  # fmt: skip
-    """Fill the gradients of planes and alphas, and of the background (CHUNKS, 3)."""
+    """Fill the gradients of planes and alphas, and `sums` (CHUNKS, 7): those of the
+    background, of `behind` and of the share.
+    """
     count, first = len(alphas), 6 if len(d_flow) else 4
     for k in numba.prange(CHUNKS):
         drawn, made = (planes, planes[-1], alphas), (g_planes, g_planes[-1], g_alphas)
         d = d_radiance, d_depth, d_motion, d_flow
-        behind, slope = background_radiance(background, bounded)
-        red = green = blue = 0.0
+        light, slope = background_radiance(background, bounded)
+        red = green = blue = late_red = late_green = late_blue = g_share = 0.0
         for i in range(k * count // CHUNKS, (k + 1) * count // CHUNKS):
-            g = compose_pixel_gradients(i, drawn, behind, least, least_alpha, d, made)
+            g = compose_pixel_gradients(i, drawn, light, least, least_alpha, d, made)
             red += g[0]
             green += g[1]
             blue += g[2]
             if len(d_late):
-                for c in range(3):
-                    g_planes[first + c, i] = d_late[i, c]
-        g_background[k, 0] = red * slope[0]
-        g_background[k, 1] = green * slope[1]
-        g_background[k, 2] = blue * slope[2]
+                g_late = mix_pixel_gradients(i, drawn, first, behind, d_late, d_late_share, made)
+                late_red += g_late[0]
+                late_green += g_late[1]
+                late_blue += g_late[2]
+                g_share += g_late[3]
+        sums[k, 0], sums[k, 1], sums[k, 2] = red * slope[0], green * slope[1], blue * slope[2]
+        sums[k, 3], sums[k, 4], sums[k, 5] = late_red, late_green, late_blue
+        sums[k, 6] = g_share

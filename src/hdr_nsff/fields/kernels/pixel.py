@@ -142,3 +142,33 @@ def compose_pixel_gradients(i, drawn, behind, least, least_alpha, d, made):
     g_depths[i], g_alphas[i] = g_depth, g_alpha
     left = 1 - alpha
     return d_radiance[i, 0] * left, d_radiance[i, 1] * left, d_radiance[i, 2] * left
+
+
+@scalar
+def mix_pixel(i, drawn, first, behind, share, late, late_share):
+    """Fill pixel i's average of what is recorded of its parts (N, 3), and the share
+    (N, 1) that it has in the pixel.
+
+    What is recorded of the Gaussians are three planes from the `first` on; `behind`
+    (3,) is that of the background, and `share` (1,) that of a pixel at rest.
+    """
+    planes, _, alphas = drawn
+    left = 1 - float(alphas[i])
+    for c in range(3):
+        late[i, c] = planes[first + c, i] + left * behind[c]
+    late_share[i, 0] = share[0] * (1 - planes[3, i])
+
+
+@scalar
+def mix_pixel_gradients(i, drawn, first, behind, d_late, d_late_share, made):
+    """Fill the gradients of the three planes at pixel i, and add to that of alpha;
+    returns those of `behind` and the share. Motion gets none.
+    """
+    planes, _, alphas = drawn
+    g_planes, _, g_alphas = made
+    for c in range(3):
+        g_planes[first + c, i] = d_late[i, c]
+        g_alphas[i] -= d_late[i, c] * behind[c]
+    left = 1 - float(alphas[i])
+    g_share = d_late_share[i, 0] * (1 - planes[3, i])
+    return d_late[i, 0] * left, d_late[i, 1] * left, d_late[i, 2] * left, g_share

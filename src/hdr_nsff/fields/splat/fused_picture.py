@@ -4,6 +4,7 @@ twin of `draw.py:composite` in training.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -17,23 +18,32 @@ from hdr_nsff.fields.splat.rasterize import Maps
 
 
 def fused_composite(
-    maps: Maps, background: Tensor, bounded: bool, far: float, least: float, least_alpha: float
+    maps: Maps,
+    background: Tensor,
+    late: tuple[Tensor, Tensor] | None,
+    with_flow: bool,
+    numbers: tuple[float, ...],
 ) -> tuple[Render, Tensor]:
-    """The render of drawn `maps`, and the flow (N, 2) where they hold it.
-
-    `background` (3,) is stored radiance; where alpha is at most `least_alpha`, the
-    depth is `far`, and nowhere is it below `least`.
+    """The render of drawn `maps`, and flow (N or 0, 2); the arguments are those of
+    `numba_picture.py:numba_composite`.
     """
     planes = maps.features.permute(2, 0, 1).flatten(1)
     alpha = maps.alpha.reshape(-1)
-    numbers = int(bounded), float(far), float(least), float(least_alpha)
-    made = Compose.apply(planes, maps.depth.reshape(-1), alpha, background, numbers)
-    radiance, depth, motion, flow = made
-    return Render(radiance, depth, alpha, motion), flow
+    mixing = late or (background.detach()[:0], background.detach()[:0])
+    bounded, *lengths = numbers
+    given = planes, maps.depth.reshape(-1), alpha, background, *mixing
+    made = Compose.apply(*given, with_flow, (int(bounded), *map(float, lengths)))
+    radiance, depth, motion, flow, *mixed = made
+    render = Render(radiance, depth, alpha, motion)
+    if late is not None:
+        render = replace(render, late=mixed[0], late_share=mixed[1])
+    return render, flow
 
 
 class Compose(torch.autograd.Function):
-    """Radiance (N, 3), depth (N,), motion (N,) and flow (N, 2), of planes (D, N)."""
+    """Radiance (N, 3), depth (N,), motion (N,), flow, and what is recorded late with
+    its share, of planes (D, N).
+    """
 
     @staticmethod
     def forward(
@@ -42,12 +52,23 @@ class Compose(torch.autograd.Function):
         depths: Tensor,
         alphas: Tensor,
         background: Tensor,
+        behind: Tensor,
+        share: Tensor,
+        with_flow: bool,
         numbers: tuple[int | float, ...],
     ) -> tuple[Tensor, ...]:
-        given = [t.detach().contiguous() for t in (planes, depths, alphas, background)]
+        tensors = planes, depths, alphas, background, behind, share
+        given = [t.detach().contiguous() for t in tensors]
         count = len(alphas)
-        flow = planes.new_empty(count if len(planes) > 4 else 0, 2)
-        made = planes.new_empty(count, 3), planes.new_empty(count), planes.new_empty(count), flow
+        mixed = count if len(share) else 0
+        made = (
+            planes.new_empty(count, 3),
+            planes.new_empty(count),
+            planes.new_empty(count),
+            planes.new_empty(count if with_flow else 0, 2),
+            planes.new_empty(mixed, 3),
+            planes.new_empty(mixed, 1),
+        )
         launch("compose", blocks_for(count), THREADS, *given, *numbers, *made)
         ctx.given = *given, *numbers
         return made
@@ -55,10 +76,10 @@ class Compose(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> Any:
-        planes, depths, alphas, background, *_ = ctx.given
+        planes, depths, alphas, background, behind, share, *_ = ctx.given
         made = [torch.empty_like(t) for t in (planes, depths, alphas)]
-        g_background = few_zeros(background, 3)
+        sums = [few_zeros(t, len(t)) for t in (background, behind, share)]
         given = *ctx.given, *(g.contiguous() for g in grads)
         grid = min(blocks_for(len(alphas))[0], MAX_BLOCKS), 1
-        launch("compose_backward", grid, THREADS, *given, *made, g_background)
-        return *made, g_background, None
+        launch("compose_backward", grid, THREADS, *given, *made, *sums)
+        return *made, *sums, None, None

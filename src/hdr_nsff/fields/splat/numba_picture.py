@@ -4,6 +4,7 @@ one back: the twin of `draw.py:composite` in training, and of `fused_picture.py`
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,25 +21,31 @@ from hdr_nsff.fields.splat.rasterize import Planes
 def numba_composite(
     drawn: Planes,
     background: Tensor,
+    late: tuple[Tensor, Tensor] | None,
     with_flow: bool,
-    with_late: bool,
     numbers: tuple[float, ...],
-) -> tuple[Render, Tensor, Tensor]:
-    """The render of what was `drawn`, flow (N or 0, 2), and what is recorded of the
-    Gaussians (N or 0, 3). The features are radiance, motion, flow, recorded.
+) -> tuple[Render, Tensor]:
+    """The render of what was `drawn`, and flow (N or 0, 2). The features are radiance,
+    motion, flow, and what is recorded of the Gaussians.
 
-    `background` (3,) is stored radiance; `numbers` are whether it is bounded, the
-    background's z-depth, the least z-depth, and the least alpha that has a depth.
+    `background` (3,) is stored radiance. `late` is what is recorded of it (3,), and the
+    share (1,) of late mixing; None without. `numbers` are whether radiance is bounded,
+    the background's z-depth, the least z-depth, and the least alpha that has a depth.
     """
     alpha = drawn.alpha.reshape(-1)
-    parts = with_flow, with_late
-    made = Compose.apply(drawn.planes.flatten(1), alpha, background, parts, numbers)
-    radiance, depth, motion, flow, late = made
-    return Render(radiance, depth, alpha, motion), flow, late
+    mixing = late or (background[:0], background[:0])
+    made = Compose.apply(drawn.planes.flatten(1), alpha, background, *mixing, with_flow, numbers)
+    radiance, depth, motion, flow, *mixed = made
+    render = Render(radiance, depth, alpha, motion)
+    if late is not None:
+        render = replace(render, late=mixed[0], late_share=mixed[1])
+    return render, flow
 
 
 class Compose(torch.autograd.Function):
-    """Radiance (N, 3), depth (N,), motion (N,), flow and recorded, of planes (D, N)."""
+    """Radiance (N, 3), depth (N,), motion (N,), flow, and what is recorded late with
+    its share, of planes (D, N).
+    """
 
     @staticmethod
     def forward(
@@ -46,19 +53,23 @@ class Compose(torch.autograd.Function):
         planes: Tensor,
         alphas: Tensor,
         background: Tensor,
-        parts: tuple[bool, bool],
+        behind: Tensor,
+        share: Tensor,
+        with_flow: bool,
         numbers: tuple[float, ...],
     ) -> tuple[Tensor, ...]:
         count = len(alphas)
-        with_flow, with_late = parts
+        mixed = count if len(share) else 0
         made = (
             torch.empty(3, count).T,
             torch.empty(count),
             torch.empty(count),
             torch.empty(2, count if with_flow else 0).T,
-            torch.empty(3, count if with_late else 0).T,
+            torch.empty(3, mixed).T,
+            torch.empty(mixed, 1),
         )
-        ctx.given = [t.detach().contiguous().numpy() for t in (planes, alphas, background)]
+        given = planes, alphas, background, behind, share
+        ctx.given = [t.detach().contiguous().numpy() for t in given]
         ctx.numbers = [float(n) for n in numbers]
         kernels.compose(*ctx.given, *ctx.numbers, *(t.numpy() for t in made))
         return made
@@ -66,12 +77,14 @@ class Compose(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> Any:
-        planes, alphas, _ = ctx.given
+        *drawn, share = ctx.given
+        planes, alphas, *_ = drawn
         given = [by_channel(g) for g in grads]
         g_planes, g_alphas = torch.empty(planes.shape), torch.empty(alphas.shape)
-        g_background = np.empty((kernels.CHUNKS, 3))
+        sums = np.empty((kernels.CHUNKS, 7))
         bounded, _, *least = ctx.numbers
-        made = g_planes.numpy(), g_alphas.numpy(), g_background
-        kernels.compose_backward(*ctx.given, bounded, *least, *given, *made)
-        of_background = torch.from_numpy(g_background.sum(0).astype(np.float32))
-        return g_planes, g_alphas, of_background, None, None
+        made = g_planes.numpy(), g_alphas.numpy(), sums
+        kernels.compose_backward(*drawn, bounded, *least, *given, *made)
+        totals = torch.from_numpy(sums.sum(0).astype(np.float32))
+        of_late = (totals[3:6], totals[6:]) if len(share) else (None, None)
+        return g_planes, g_alphas, totals[:3], *of_late, None, None

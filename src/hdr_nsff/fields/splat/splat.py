@@ -179,13 +179,10 @@ class Splat(nn.Module):
         knot = self.knot(batch.time)
         flow_turn = batch.seed % 2 == 0
         offsets = neighbor_in_turn(batch) if flow_turn else []
-        recorder = None if self.late_mixing is None else batch.recorder
-        due = offsets, not flow_turn, recorder, self.shutter
+        late = None if batch.recorder is None else self.late_mixing
+        due = offsets, not flow_turn, late, self.shutter
         seen = see(self.model(), TrainingView(batch, knot, self.alive(knot), *due))
         render, flow = seen.render, seen.flow
-        if self.late_mixing is not None and seen.parts is not None and seen.late is not None:
-            average, share = self.late_mixing(seen.parts, seen.late, render)
-            render = replace(render, late=average, late_share=share)
         certain = constant((1.0,), flow.device, flow.dtype).expand(len(render.opacity))
         warps = tuple(Warp(o, flow, certain, None) for o in offsets)
         render = replace(render, warps=warps)

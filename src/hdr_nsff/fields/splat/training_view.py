@@ -26,8 +26,9 @@ from hdr_nsff.fields.splat.draw import (
     seen_radiance,
 )
 from hdr_nsff.fields.splat.fused_cloud import fused_cloud
+from hdr_nsff.fields.splat.fused_parts import fused_parts
 from hdr_nsff.fields.splat.fused_picture import fused_composite
-from hdr_nsff.fields.splat.late_mixing import Parts, split_late
+from hdr_nsff.fields.splat.late_mixing import LateMixing, Parts, split_late
 from hdr_nsff.fields.splat.local_gaussians import Living
 from hdr_nsff.fields.splat.model import Model
 from hdr_nsff.fields.splat.moment import MAX_FLOW, Cloud, Moment
@@ -36,7 +37,7 @@ from hdr_nsff.fields.splat.numba_picture import numba_composite
 from hdr_nsff.fields.splat.rasterize import Maps, rasterize, rasterize_planes
 from hdr_nsff.fields.splat.shutter import Shutter, apparent_motion
 from hdr_nsff.fields.splat.terms import mixture_difference, regularizers
-from hdr_nsff.scene.batch import PixelBatch, Recorder
+from hdr_nsff.scene.batch import PixelBatch
 
 CloudMaker = Callable[[Model, Moment, Tensor], Cloud]
 
@@ -50,7 +51,7 @@ class TrainingView:
     alive: Tensor  # (A,) the time-local Gaussians that are alive
     offsets: list[int]  # of the neighbors that flow is due to, one at most
     rigidity: bool  # whether rigidity and evenness are due
-    recorder: Recorder | None = None  # of the Gaussians one by one, with late mixing
+    late: LateMixing | None = None  # which records the Gaussians one by one
     shutter: Shutter | None = None  # None: a moment
 
 
@@ -61,8 +62,6 @@ class Seen:
     render: Render
     flow: Tensor  # (S, 2) px to the neighbor; (S, 0) where none is due
     terms: dict[str, Tensor]  # the field's own, by the names of their weights
-    parts: Parts | None  # the Gaussians and the background, recorded
-    late: Tensor | None  # (S, 3) what is recorded of the Gaussians, by their weights
 
 
 def see(model: Model, view: TrainingView) -> Seen:
@@ -71,32 +70,45 @@ def see(model: Model, view: TrainingView) -> Seen:
     if make_cloud is None:
         return see_by_torch(model, view)
     cloud = cloud_by_kernels(model, view, make_cloud)
-    features, parts = cloud.features, None
-    if view.recorder is not None:
-        radiance = features[:, :3]
-        parts = record_parts(model, view.recorder, view.batch.camera, radiance, cloud.means)
-        features = torch.cat([features, parts.gaussians], 1)
+    features, late = cloud.features, None
+    if view.late is not None:
+        features, behind = recorded_features(model, view, cloud)
+        late = behind, view.late.share
     gaussians = cloud.means, cloud.quaternions, cloud.scales, cloud.opacities, features
     numbers = model.bounded, model.far, MIN_DEPTH_SHARE * model.unit, MIN_ALPHA
-    late: Tensor | None
+    given = model.background, late, bool(view.offsets), numbers
     if make_cloud is numba_cloud:
         planes = rasterize_planes(*gaussians, view.batch.camera)
-        kinds = bool(view.offsets), parts is not None
-        render, flow, late = numba_composite(planes, model.background, *kinds, numbers)
+        render, flow = numba_composite(planes, *given)
     else:
-        maps, late = split_late(rasterize(*gaussians, view.batch.camera), parts)
-        render, flow = fused_composite(maps, model.background, *numbers)
-    return Seen(render, flow, cloud.terms, parts, None if parts is None else late)
+        render, flow = fused_composite(rasterize(*gaussians, view.batch.camera), *given)
+    return Seen(render, flow, cloud.terms)
+
+
+def recorded_features(model: Model, view: TrainingView, cloud: Cloud) -> tuple[Tensor, Tensor]:
+    """The features (G, F + 3) of a cloud with what is recorded of its Gaussians, and
+    what is recorded of the background (3,).
+    """
+    camera, recorder = view.batch.camera, view.batch.recorder
+    assert recorder is not None
+    if recorder.sensor is not None:
+        light = model.background, model.bounded
+        return fused_parts(cloud.features, cloud.means, camera, *light, recorder.sensor)
+    parts = record_parts(model, recorder, camera, cloud.features[:, :3], cloud.means)
+    return torch.cat([cloud.features, parts.gaussians], 1), parts.background[0]
 
 
 def see_by_torch(model: Model, view: TrainingView) -> Seen:
     """The same by plain torch."""
     maps, parts, terms = draw_by_torch(model, view)
-    maps, late = split_late(maps, parts)
+    maps, recorded = split_late(maps, parts)
     render, drawn = composite(model, maps)
+    if view.late is not None and parts is not None and recorded is not None:
+        average, share = view.late(parts, recorded, render)
+        render = replace(render, late=average, late_share=share)
     # features are premultiplied by opacity
     flow = drawn / render.opacity.clamp_min(MIN_ALPHA)[:, None]
-    return Seen(render, flow, terms, parts, late)
+    return Seen(render, flow, terms)
 
 
 def cloud_maker(model: Model, view: TrainingView) -> CloudMaker | None:
@@ -125,9 +137,9 @@ def draw_by_torch(model: Model, view: TrainingView) -> tuple[Maps, Parts | None,
     cloud = cloud_at(model, knot, living)
     extra = [flow_to_neighbor(model, view, living, cloud.means, o) for o in view.offsets]
     parts = None
-    if view.recorder is not None:
+    if view.late is not None and batch.recorder is not None:
         radiance = seen_radiance(model, batch.camera, cloud)
-        parts = record_parts(model, view.recorder, batch.camera, radiance, cloud.means)
+        parts = record_parts(model, batch.recorder, batch.camera, radiance, cloud.means)
         extra.append(parts.gaussians)
     maps = expose(model, view, living, cloud, extra)
     model.trajectories.mark(knot)

@@ -28,7 +28,8 @@ from hdr_nsff.fields.kernels.cuda import layout
 STATIC, MOVING, LOCAL = "f2 f2 f2 f1 f2 f3", "f2 f2 f2 f1 f2 f3 f3 f2", "f2 f2 f2 f2 f2"
 SIGHT, CLOUD = "d1 f2 f2 f2 f2", "f2 f2 f2 f1 f2 f1"
 PIXELS = "f2 f2 f1 f1 f1 f1 b1 b1 f2 f2 b1"  # what is rendered, recorded and known before
-MAPS = "f2 f1 f1 f1 i0 d0 d0 d0"  # what is drawn, and what lies behind it
+MAPS = "f2 f1 f1 f1 f1 f1 i0 d0 d0 d0"  # what is drawn, and what lies behind it
+SENSOR = "f1 f2 f1 f2 f1 i0 d0 i0 d0"  # gain, curve and lens of a frame
 # what a tone mapper has learned and holds, and which of it is wanted
 TONE = "f3 f1 i1 f1 f2 f2 f2 f3 f1 f2 f2 d0 i0 i0 i0 i0"
 LEVELS = "i2 i2 f2"  # of a grid, and its slices of time
@@ -50,14 +51,14 @@ SIGNATURES = {
     "coords_backward": f"f2 f2 f2 {LEVELS} f2",
     "adam_rows": f"{ROWS * layout.ADAM_TABLES}d0 d0 d0 d0",
     "living": "f2 f2 d0 d0 b1",
-    "respond": "f2 f1 f2 f1 i0 d0 f2",
-    "respond_backward": "f2 f1 f2 f1 i0 d0 f2 f2 f1 f2",
-    "shade": "f2 f2 f2 f1 f2 i0 d0 f2",
-    "shade_backward": "f2 f2 f2 f1 f2 i0 d0 f2 f2 f2",
+    "photograph": f"f2 f2 f2 f2 f2 {SENSOR} f2",
+    "photograph_backward": f"f2 f2 f2 f2 f2 {SENSOR} f2 f2 f2 f2 f1 f2 f2",
+    "record_parts": f"f2 f1 f2 f2 f2 i0 i0 i0 {SENSOR} f2 f1",
+    "record_parts_backward": f"f2 f1 f2 f2 f2 i0 i0 i0 {SENSOR} f2 f1 f2 f1 f1 f2 f2",
     "losses": f"{PIXELS} d0 d0 d0 d0 f1",
     "losses_backward": f"{PIXELS} d0 d0 d0 d0 f1 f1 f2 f1 f1 f2",
-    "compose": f"{MAPS} f2 f1 f1 f2",
-    "compose_backward": f"{MAPS} f2 f1 f1 f2 f2 f1 f1 f1",
+    "compose": f"{MAPS} f2 f1 f1 f2 f2 f2",
+    "compose_backward": f"{MAPS} f2 f1 f1 f2 f2 f2 f2 f1 f1 f1 f1 f1",
     "tone": f"{TONE} f3 f1 f1",
     "tone_backward": f"{TONE} f3 f1 f2 f1 f1 f3 f1 f2 f2 f2",
     "local_backward": f"{LOCAL} i1 s2 i0 {SIGHT} {CLOUD} {LOCAL} b1 b1 b1 b1 b1",
@@ -70,6 +71,7 @@ MODULES = (
     "adam_kernels",
     "grid_kernels",
     "picture_kernels",
+    "recording_kernels",
     "tone_kernels",
 )  # that hold the kernels
 # these may take every number for a finite one: `project` has thrown out the others
