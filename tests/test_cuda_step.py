@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from simulator import assert_passed, names_in
 
-FILES = ("cloud", "picture", "tone", "grid", "step")
+FILES = ("cloud", "picture", "tone", "grid", "adam", "step")
 PATHS = [Path(__file__).with_name(f"simulated_{name}.py") for name in FILES]
 
 

@@ -12,6 +12,8 @@ from torch import Tensor
 
 from hdr_nsff.core.param_group import ParamGroup
 from hdr_nsff.fields.nsff.encodings import TouchedAdam
+from hdr_nsff.fields.splat.cuda_backends import kernels_on
+from hdr_nsff.training.kernel_adam import KernelAdam
 
 
 class Optimizers:
@@ -25,7 +27,11 @@ class Optimizers:
         touched = [group for group in groups if group.row_marks is not None]
         self.by_name: dict[str, torch.optim.Optimizer] = {}
         if dense:  # grids without a tone mapper have nothing dense
-            self.by_name["dense"] = torch.optim.Adam([as_dict(g) for g in dense], fused=True)
+            by_kernel = kernels_on(dense[0].params[0].device)
+            options = [as_dict(group) for group in dense]
+            self.by_name["dense"] = (
+                KernelAdam(options) if by_kernel else torch.optim.Adam(options, fused=True)
+            )
         if touched:
             self.by_name["touched"] = TouchedAdam([as_dict(g) for g in touched])
         self.groups = {"dense": dense, "touched": touched}

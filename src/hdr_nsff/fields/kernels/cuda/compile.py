@@ -33,6 +33,7 @@ SENSOR = "f1 f2 f1 f2 f1 i0 d0 i0 d0"  # gain, curve and lens of a frame
 # what a tone mapper has learned and holds, and which of it is wanted
 TONE = "f3 f1 i1 f1 f2 f2 f2 f3 f1 f2 f2 d0 i0 i0 i0 i0"
 LEVELS = "i2 i2 f2"  # of a grid, and its slices of time
+VECTOR = "f1 f1 f1 f1 d0 d0 "  # numbers, gradient, moments; lr, eps
 ROWS = "f2 f2 f2 f2 b1 d0 d0 "  # a table, gradient, moments, marks; lr, eps
 # argument types of the kernels, in order: type and number of dimensions, 0 for a number
 SIGNATURES = {
@@ -49,6 +50,7 @@ SIGNATURES = {
     "interpolate": f"f2 f2 {LEVELS} f2",
     "table_backward": f"f2 f2 {LEVELS} f2 b1",
     "coords_backward": f"f2 f2 f2 {LEVELS} f2",
+    "adam": f"{VECTOR * layout.ADAM_VECTORS}d0 d0 d0 d0",
     "adam_rows": f"{ROWS * layout.ADAM_TABLES}d0 d0 d0 d0",
     "living": "f2 f2 d0 d0 b1",
     "photograph": f"f2 f2 f2 f2 f2 {SENSOR} f2",
