@@ -94,7 +94,7 @@ def draw(document, arrays, time, c2w, K, width, height):
     c2w, K, size = np.asarray(c2w), np.asarray(K), np.array([width, height])
     means, roots, opacities, radiance = gaussians(document, arrays, time, c2w[:, 3])
     t = (means - c2w[:, 3]) @ c2w[:, :3]  # camera points
-    kept = np.flatnonzero((t[:, 2] > 0.01) & (opacities >= 1 / 255))
+    kept = np.flatnonzero((t[:, 2] > 0.01 * document["near"]) & (opacities >= 1 / 255))
     focal, middle = K[[0, 1], [0, 1]], K[:2, 2]
     edge = 0.15 * size / focal
     picture, left = np.zeros((height, width, 3)), np.ones((height, width))

@@ -5,6 +5,7 @@ process with NUMBA_ENABLE_CUDASIM=1, which numba reads when it is imported.
 
 import ctypes
 import math
+import struct
 import threading
 from typing import Any, ClassVar
 
@@ -72,6 +73,17 @@ def test_gaussians_behind_the_camera() -> None:
     view = camera(16, 16)
     seen = compare_both(at_depths(view, (-2.0, 0.0), 1.0), view)
     assert float(seen.abs().max()) == 0  # and so is the largest gradient
+
+
+def test_nothing_nearer_than_asked_for_is_drawn() -> None:
+    view = camera(16, 16)
+    gaussians = [t.float() for t in at_depths(view, (0.5, 1.5), 1.0, 0.1)]
+    w2c, K = world_to_camera_and_focal(view).float(), view.K.float()
+    ours = rasterize_cuda.composite(*gaussians, w2c, K, (16, 16), 1.0)
+    for seen, expected in zip(ours, rasterize(*gaussians, view, 1.0), strict=True):
+        torch.testing.assert_close(seen, expected, rtol=1e-4, atol=1e-4)
+    every = rasterize(*gaussians, view)
+    assert float((ours[2] - every.alpha).abs().max()) > 0.1
 
 
 def test_gaussians_across_the_near_plane() -> None:
@@ -197,7 +209,8 @@ class SimulatedDriver(Contexts):
         for code in SIGNATURES[self.name].split():
             dimensions = int(code[1])
             if not dimensions:
-                arguments.append(numbers.pop(0))
+                number = struct.pack("q", numbers.pop(0))
+                arguments += struct.unpack("d" if code[0] == "d" else "q", number)
                 continue
             meminfo, parent, _, item, address, *shape = numbers[: 5 + dimensions]
             strides = numbers[5 + dimensions : 5 + 2 * dimensions]

@@ -103,7 +103,7 @@ def like_those(made: Tensor, there: bool) -> Tensor:
 
 
 def draw_nothing(*arguments: Any) -> Maps:
-    *gaussians, camera = arguments
+    *gaussians, camera, _ = arguments
     return Maps(*NothingDrawn.apply(camera, *gaussians))
 
 

@@ -171,6 +171,21 @@ def test_kernels_equal_plain_torch_across_the_near_plane(size: float) -> None:
     assert float(compare(gaussians, view, gradients=5e-3)[..., -1].max()) > 0.5
 
 
+@pytest.mark.parametrize("length", [1e-3, 1e3])
+def test_pictures_do_not_depend_on_the_unit_of_length(length: float) -> None:
+    view = camera()
+    means, quaternions, scales, *others = (t.float() for t in scene(1, view))
+    # every other Gaussian near the camera, some of them nearer than what is drawn
+    means[::2] = ahead(view, torch.rand(30, 3) * torch.tensor([0.0, 0, 0.03])).float()
+    pose = view.c2w * torch.tensor([1, 1, 1, length])
+    expected = rasterize(means, quaternions, scales, *others, view)
+    scaled = means * length, quaternions, scales * length, *others
+    seen = rasterize(*scaled, view.moved(pose), footprint.NEAREST * length)
+    for a, b, unit in zip(seen, expected, (1, length, 1), strict=True):
+        torch.testing.assert_close(a / unit, b, rtol=1e-3, atol=1e-4)
+    assert not torch.allclose(rasterize(*scaled, view.moved(pose)).alpha, expected.alpha)
+
+
 def test_kernels_equal_plain_torch_at_the_frames_edge_and_beyond_it() -> None:
     view = camera()
     gaussians = at_depths(view, (1.0, 2.0), 3.0)

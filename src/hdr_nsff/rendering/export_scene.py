@@ -56,6 +56,7 @@ def export_usd(run: Run, path: Path) -> Path:
         times,
         [frame.camera for frame in first],
         [frame.time for frame in first],
+        run.field.model().nearest,
         run.scene.manifest.fps,
         facts,
     )

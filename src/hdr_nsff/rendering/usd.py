@@ -17,7 +17,6 @@ import numpy as np
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import atomic
-from hdr_nsff.fields.kernels.footprint import NEAREST
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.rendering.ply import SH_0
 
@@ -70,11 +69,13 @@ def write_usd(
     times: Sequence[float],
     cameras: Sequence[Camera],
     camera_times: Sequence[float],
+    nearest: float,
     fps: float,
     facts: Mapping[str, Any],
 ) -> None:
     """Write Gaussians at `times` and a camera at `camera_times` (frames), atomically.
 
+    `nearest` is the z-depth of which nothing nearer is drawn.
     `facts` become customLayerData.
     """
     from pxr import Usd, UsdGeom
@@ -94,7 +95,7 @@ def write_usd(
         stage.SetDefaultPrim(root.GetPrim())
         for track in tracks:
             write_track(stage, track, times)
-        write_camera(stage, cameras, camera_times)
+        write_camera(stage, cameras, camera_times, nearest)
         stage.GetRootLayer().Save()
 
 
@@ -131,13 +132,15 @@ def packed(values: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(values, np.float32)
 
 
-def write_camera(stage: Any, cameras: Sequence[Camera], times: Sequence[float]) -> None:
+def write_camera(
+    stage: Any, cameras: Sequence[Camera], times: Sequence[float], nearest: float
+) -> None:
     """The camera as filmed, with its principal point."""
     from pxr import Gf, Usd, UsdGeom
 
     prim = UsdGeom.Camera.Define(stage, f"{ROOT}/Camera")
     transform = prim.AddTransformOp()
-    prim.GetClippingRangeAttr().Set(Gf.Vec2f(NEAREST, FARTHEST))
+    prim.GetClippingRangeAttr().Set(Gf.Vec2f(nearest, FARTHEST))
     for camera, time in zip(cameras, times, strict=True):
         code = Usd.TimeCode(time)
         fx, fy, cx, cy = (float(camera.K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))

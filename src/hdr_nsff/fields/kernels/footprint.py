@@ -25,7 +25,8 @@ from hdr_nsff.core.jit import jit
 # dy, u dx^2, u dx dy and u dy^2
 MOMENTS = 6
 ALPHA_MIN = np.float32(1 / 255)  # alpha below this counts as 0
-NEAREST = 0.01  # z-depth, scene units: nothing nearer is drawn (gsplat's default)
+# z-depth, in units of a scene's near depth: nothing nearer is drawn (gsplat's default)
+NEAREST = 0.01
 # pixels^2 added to 2D variances, so that no Gaussian falls between pixels (Kerbl et al.
 # 2023)
 BLUR = 0.3
@@ -85,8 +86,8 @@ def jacobian(k, held):
 def footprint(m, q, s, v, k, width, height):
     """A Gaussian of mean m, quaternion q and scales s in a camera's picture.
 
-    The camera has world-to-camera matrix v, three rows of 4 numbers, and intrinsics k =
-    (fx, fy, cx, cy).
+    The camera has world-to-camera matrix v, three rows of 4 numbers, and k = (fx, fy,
+    cx, cy, nearest): its intrinsics, and the z-depth that is the nearest drawn.
     Returns the camera point t (3,); `held`, the point where the projection is
     linearized and whether its x and y are clamped; T = J W (2, 3); the triple of
     `rotation`; V = T R S (2, 3); and the 2D covariance V V^T + blur (xx, xy, yy).
@@ -96,8 +97,8 @@ def footprint(m, q, s, v, k, width, height):
         v[1][0] * m[0] + v[1][1] * m[1] + v[1][2] * m[2] + v[1][3],
         v[2][0] * m[0] + v[2][1] * m[1] + v[2][2] * m[2] + v[2][3],
     )
-    z = t[2] if t[2] > NEAREST else NEAREST
-    fx, fy, cx, cy = k[0], k[1], k[2], k[3]
+    fx, fy, cx, cy, nearest = k[0], k[1], k[2], k[3], k[4]
+    z = t[2] if t[2] > nearest else nearest
     edge_x, edge_y = MARGIN * 0.5 * width / fx, MARGIN * 0.5 * height / fy
     x, held_x = clamp_ratio(t[0], z, -cx / fx - edge_x, (width - cx) / fx + edge_x)
     y, held_y = clamp_ratio(t[1], z, -cy / fy - edge_y, (height - cy) / fy + edge_y)
@@ -146,13 +147,13 @@ def outline(covariance, o):
 def ellipse(t, covariance, o, k, width, height):
     """What a Gaussian of camera point t (3,) and opacity o covers of the picture.
 
-    `covariance` is its 2D one (xx, xy, yy), k = (fx, fy, cx, cy). Returns whether it
+    `covariance` is its 2D one (xx, xy, yy), k that of `footprint`. Returns whether it
     shows at all, its pixel center (2,), its conic (3,), and its bounds in pixels: left,
     top, right, bottom.
     """
     xx, xy, yy = covariance
     hidden = False, (0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)
-    if not (t[2] > NEAREST and ALPHA_MIN <= o < math.inf):
+    if not (t[2] > k[4] and ALPHA_MIN <= o < math.inf):
         return hidden  # behind, too faint, or not finite
     x, y = k[0] * t[0] / t[2] + k[2], k[1] * t[1] / t[2] + k[3]
     reach = reach_of(o)

@@ -62,7 +62,7 @@ def project(
 ):
     """Project world Gaussians into the picture of a camera.
 
-    `w2c` is (3, 4), `k` = (fx, fy, cx, cy). `means` (G, 3) and `scales` (G, 3) are in
+    `w2c` is (3, 4), `k` that of `footprint`. `means` (G, 3) and `scales` (G, 3) are in
     scene units, `quaternions` (G, 4) w x y z of any length, `opacities` (G,) in [0, 1].
     Fills pixel `centers` (G, 2), z-`depths` (G,), `conics` (G, 3), `outlines` (G, 4)
     and tile `boxes` (G, 4: x0, y0, x1, y1). Boxes exclude their ends, and are empty

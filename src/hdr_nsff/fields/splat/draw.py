@@ -25,9 +25,8 @@ def draw(model: Model, camera: Camera, cloud: GaussianCloud, extra: list[Tensor]
     """Rasterize radiance (3), motion (1) and `extra` features (G, ...)."""
     radiance = seen_radiance(model, camera, cloud)
     features = torch.cat([radiance, cloud.motion[:, None], *extra], 1)
-    return rasterize(
-        cloud.means, cloud.quaternions, cloud.scales, cloud.opacities, features, camera
-    )
+    gaussians = cloud.means, cloud.quaternions, cloud.scales, cloud.opacities, features
+    return rasterize(*gaussians, camera, model.nearest)
 
 
 def seen_radiance(model: Model, camera: Camera, cloud: GaussianCloud) -> Tensor:

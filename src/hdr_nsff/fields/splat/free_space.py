@@ -90,7 +90,8 @@ def vote(field: Splat, frame: Frame, surface: Tensor) -> Tensor:
     disparity, confidence = surface.unbind(1)
     with torch.enable_grad():
         shapes = cloud.means, cloud.quaternions, cloud.scales, cloud.opacities
-        drawn = rasterize(*shapes, features, frame.camera).features.flatten(0, 1)
+        maps = rasterize(*shapes, features, frame.camera, field.model().nearest)
+        drawn = maps.features.flatten(0, 1)
         pixel_weights = torch.stack([confidence * disparity, confidence], 1)
         (sums,) = torch.autograd.grad((drawn * pixel_weights).sum(), features)
     total, weight = sums[: len(field.static)].unbind(1)

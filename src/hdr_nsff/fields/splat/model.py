@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from hdr_nsff.fields.kernels.footprint import NEAREST
 from hdr_nsff.fields.knots import knot_of, time_at
 from hdr_nsff.fields.splat.gaussians import Gaussians
 from hdr_nsff.fields.splat.local_gaussians import LocalGaussians
@@ -41,6 +42,11 @@ class Model:
     def view_dependence(self) -> bool:
         """Whether colors change with the direction of view."""
         return bool(len(self.static.sh1) + len(self.moving.sh1))
+
+    @property
+    def nearest(self) -> float:
+        """The z-depth, in scene units, of which nothing nearer is drawn."""
+        return NEAREST * self.unit
 
     # Time
 

@@ -46,19 +46,21 @@ def rasterize(
     opacities: Tensor,
     features: Tensor,
     camera: Camera,
+    nearest: float = footprint.NEAREST,
 ) -> Maps:
     """Composite G Gaussians front to back by the z-depth of their means.
 
     `means` (G, 3) and `scales` (G, 3; standard deviations > 0) in scene units,
     `quaternions` (G, 4) w x y z of any length, `opacities` (G,) in [0, 1], `features`
-    (G, D) anything. Gaussians whose shape or opacity is not finite are not drawn.
+    (G, D) anything. Gaussians whose shape or opacity is not finite are not drawn, nor
+    are those of a z-depth of `nearest` or less, in scene units.
     Float32 on the CPU or on CUDA; every other dtype and device takes `dense`.
     """
     gaussians = means, quaternions, scales, opacities, features
     device = means.device.type if means.dtype == torch.float32 else None
     match device:
         case "cpu":
-            planes, alpha = rasterize_planes(*gaussians, camera)
+            planes, alpha = rasterize_planes(*gaussians, camera, nearest)
             # `split` joins the two gradients, where slices' would be added up
             seen, depth = planes.split([len(planes) - 1, 1])
             return Maps(seen.permute(1, 2, 0), depth[0], alpha)
@@ -66,11 +68,11 @@ def rasterize(
             composite = composite_on(means.device)
             if composite is None:
                 # not `dense`, which would hold every Gaussian at every pixel
-                on_cpu = rasterize(*to_device(gaussians, "cpu"), to_device(camera, "cpu"))
+                on_cpu = rasterize(*to_device(gaussians, "cpu"), to_device(camera, "cpu"), nearest)
                 return Maps(*(m.to(means.device) for m in on_cpu))
-            return composite_view(composite, gaussians, camera)
+            return composite_view(composite, gaussians, camera, nearest)
         case _:
-            return dense(*gaussians, camera)
+            return dense(*gaussians, camera, nearest)
 
 
 def rasterize_planes(
@@ -80,19 +82,27 @@ def rasterize_planes(
     opacities: Tensor,
     features: Tensor,
     camera: Camera,
+    nearest: float = footprint.NEAREST,
 ) -> Planes:
     """`rasterize` by the numba kernels of the CPU, as these draw: plane by plane."""
     gaussians = means, quaternions, scales, opacities, features
-    return Planes(*RasterizeNumba.apply(*gaussians, world_to_camera_and_focal(camera), camera))
+    w2c = world_to_camera_and_focal(camera)
+    return Planes(*RasterizeNumba.apply(*gaussians, w2c, camera, nearest))
 
 
-def composite_view(composite: Composite, gaussians: tuple[Tensor, ...], camera: Camera) -> Maps:
+def composite_view(
+    composite: Composite,
+    gaussians: tuple[Tensor, ...],
+    camera: Camera,
+    nearest: float = footprint.NEAREST,
+) -> Maps:
     """`rasterize` by a rasterizer of CUDA devices."""
     if camera.c2w.requires_grad or camera.K.requires_grad:
         w2c = world_to_camera_and_focal(camera)
     else:
         w2c = held_pose(camera.c2w)
-    return Maps(*composite(*gaussians, w2c, camera.K.detach(), (camera.width, camera.height)))
+    size = camera.width, camera.height
+    return Maps(*composite(*gaussians, w2c, camera.K.detach(), size, nearest))
 
 
 @lru_cache(maxsize=4096)
@@ -165,7 +175,11 @@ def rotation_matrices(quaternions: Tensor) -> Tensor:
 
 
 def project(
-    means: Tensor, quaternions: Tensor, scales: Tensor, camera: Camera
+    means: Tensor,
+    quaternions: Tensor,
+    scales: Tensor,
+    camera: Camera,
+    nearest: float = footprint.NEAREST,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Pixel centers (G, 2), 2D covariances (G, 2, 2) in pixels^2 and z-depths (G,).
 
@@ -173,7 +187,7 @@ def project(
     """
     w2c, K = world_to_camera(camera), camera.K
     t = means @ w2c[:, :3].T + w2c[:, 3]  # camera points
-    z = t[:, 2].clamp_min(footprint.NEAREST)
+    z = t[:, 2].clamp_min(nearest)
     size = torch.tensor([camera.width, camera.height]).to(means)
     focal, center = K[[0, 1], [0, 1]], K[:2, 2]
     # far outside of the frame the projection is linearized at its edge
@@ -198,6 +212,7 @@ def dense(
     opacities: Tensor,
     features: Tensor,
     camera: Camera,
+    nearest: float = footprint.NEAREST,
     cut: bool = True,
 ) -> Maps:
     """The plain-torch twin: every Gaussian at every pixel, any dtype and device.
@@ -209,9 +224,9 @@ def dense(
     means, features = means[finite], features[finite]
     quaternions, scales = quaternions[finite], scales[finite]
     opacities = opacities[finite]
-    centers, covariance, z = project(means, quaternions, scales, camera)
+    centers, covariance, z = project(means, quaternions, scales, camera, nearest)
     order = torch.argsort(z.detach(), stable=True)
-    order = order[z.detach()[order] > footprint.NEAREST]
+    order = order[z.detach()[order] > nearest]
     d = camera.pixel_grid().to(means)[:, None] - centers[order]  # (S, G, 2)
     inverse = torch.linalg.inv(covariance[order])
     exponent = 0.5 * (d[:, :, None] @ inverse @ d[..., None])[..., 0, 0]
@@ -265,12 +280,14 @@ class RasterizeNumba(torch.autograd.Function):
         features: Tensor,
         w2c: Tensor,
         camera: Camera,
+        nearest: float,
     ) -> tuple[Tensor, Tensor]:
         gaussians = [
             t.detach().contiguous().numpy() for t in (means, quaternions, scales, opacities)
         ]
         pose = w2c.detach().double().numpy()
-        k = camera.K.detach().double().numpy()[[0, 1, 0, 1], [0, 1, 2, 2]]  # fx, fy, cx, cy
+        fx_fy_cx_cy = camera.K.detach().double().numpy()[[0, 1, 0, 1], [0, 1, 2, 2]]
+        k = np.append(fx_fy_cx_cy, nearest)
         count, (width, height) = len(means), (camera.width, camera.height)
         centers = np.empty((count, 2), np.float32)
         depths = np.empty(count, np.float32)
@@ -310,4 +327,4 @@ class RasterizeNumba(torch.autograd.Function):
         projection.project_backward(*ctx.gaussians, *ctx.view, owned, pairs, *arrays)
         grad_pose = poses.double().sum(0).view(3, 4).to(maps) if len(poses) else None
         grad_features = out[4][:, :-1]  # without the z-depth, whose gradient is in the means
-        return *out[:4], grad_features, grad_pose, None
+        return *out[:4], grad_features, grad_pose, None, None

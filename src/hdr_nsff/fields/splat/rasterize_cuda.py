@@ -17,7 +17,7 @@ from torch import Tensor
 
 from hdr_nsff.fields.kernels.cuda.launch import blocks_for, launch
 from hdr_nsff.fields.kernels.cuda.layout import CHANNELS, ELLIPSE, PIXELS, THREADS, TILE
-from hdr_nsff.fields.kernels.footprint import MOMENTS
+from hdr_nsff.fields.kernels.footprint import MOMENTS, NEAREST
 from hdr_nsff.fields.splat.try_out import fault_of
 
 
@@ -55,6 +55,7 @@ def composite(
     w2c: Tensor,
     K: Tensor,
     size: tuple[int, int],
+    nearest: float = NEAREST,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Features (H, W, D), z-depth (H, W) and alpha (H, W) of Gaussians.
 
@@ -63,7 +64,7 @@ def composite(
     reach everything but `K`.
     """
     gaussians = means, quaternions, scales, opacities, features
-    seen, depth, alpha = RasterizeCuda.apply(*gaussians, w2c, K, size)
+    seen, depth, alpha = RasterizeCuda.apply(*gaussians, w2c, K, size, float(nearest))
     return seen.permute(1, 2, 0), depth, alpha
 
 
@@ -85,10 +86,11 @@ class RasterizeCuda(torch.autograd.Function):
         w2c: Tensor,
         K: Tensor,
         size: tuple[int, int],
+        nearest: float,
     ) -> tuple[Tensor, Tensor, Tensor]:
         parts = (means, quaternions, scales, opacities)
         gaussians = [t.detach().contiguous() for t in parts]
-        view = w2c.detach().contiguous(), K.detach().contiguous(), *size
+        view = w2c.detach().contiguous(), K.detach().contiguous(), *size, nearest
         count, (width, height) = len(means), size
         num_features = features.shape[1]  # z-depth comes after them
         num_chunks = -(-(num_features + 1) // CHANNELS)
@@ -125,7 +127,7 @@ class RasterizeCuda(torch.autograd.Function):
         if needs_pose:
             grad_pose = poses.sum(0, dtype=torch.float64).view(3, 4).to(means)
         grad_features = sums[:, MOMENTS : MOMENTS + ctx.num_features]
-        return *out, grad_features, grad_pose, None, None
+        return *out, grad_features, grad_pose, None, None, None
 
 
 def sort_pairs(

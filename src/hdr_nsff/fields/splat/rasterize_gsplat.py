@@ -3,8 +3,8 @@
 It draws where our own kernels cannot.
 
 It draws by the same rules as the kernels for the CPU: 0.3 pixels^2 of blur, alpha
-between 1/255 and 0.999, nothing nearer than 0.01, and outside of the frame a projection
-that is linearized at its edge.
+between 1/255 and 0.999, nothing nearer than a given z-depth, and outside of the frame a
+projection that is linearized at its edge.
 """
 
 from __future__ import annotations
@@ -55,6 +55,7 @@ def composite(
     w2c: Tensor,
     K: Tensor,
     size: tuple[int, int],
+    nearest: float = NEAREST,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Features (H, W, D), z-depth (H, W) and alpha (H, W) of Gaussians.
 
@@ -76,7 +77,7 @@ def composite(
         K[None],
         width,
         height,
-        near_plane=NEAREST,
+        near_plane=nearest,
         eps2d=BLUR,
         packed=False,
         render_mode="RGB+D",

@@ -75,13 +75,14 @@ def see(model: Model, view: TrainingView) -> Seen:
         features, behind = recorded_features(model, view, cloud)
         late = behind, view.late.share
     gaussians = cloud.means, cloud.quaternions, cloud.scales, cloud.opacities, features
+    seen_from = *gaussians, view.batch.camera, model.nearest
     numbers = model.bounded, model.far, MIN_DEPTH_SHARE * model.unit, MIN_ALPHA
     given = model.background, late, bool(view.offsets), numbers
     if make_cloud is numba_cloud:
-        planes = rasterize_planes(*gaussians, view.batch.camera)
+        planes = rasterize_planes(*seen_from)
         render, flow = numba_composite(planes, *given)
     else:
-        render, flow = fused_composite(rasterize(*gaussians, view.batch.camera), *given)
+        render, flow = fused_composite(rasterize(*seen_from), *given)
     return Seen(render, flow, cloud.terms)
 
 

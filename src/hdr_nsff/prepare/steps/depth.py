@@ -50,7 +50,7 @@ def find_depth(work: Work) -> StepResult:
     known = np.mean([(map > 0.5).mean() for _, map in sampled])
     indices = [f.index for f in work.train]
     return StepResult(
-        note=f"{known:.0%} of the pixels well known, near {near:.2f}, far {far:.2f} scene units",
+        note=f"{known:.0%} of the pixels well known, near {near:.3g}, far {far:.3g} scene units",
         details=details,
         manifest={"near": near, "far": far},
         maps={

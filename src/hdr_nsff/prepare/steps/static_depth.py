@@ -221,7 +221,7 @@ def depth_anything(work: Work) -> Depth:
     return Depth(
         disparity,
         confidence,
-        f"{name} ({kind}), near {near:.2f}, far {far:.2f} scene units",
+        f"{name} ({kind}), near {near:.3g}, far {far:.3g} scene units",
         "depth-anything",
         details={"kind": kind, "weights": name},
         manifest={"near": near, "far": far},

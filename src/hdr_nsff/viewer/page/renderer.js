@@ -8,6 +8,7 @@ import { makeTable, makeTables, setNearest } from "./tables.js";
 export const VIEWS = ["radiance", "depth", "motion", "flow"];
 const FEATURES = { radiance: 0, depth: 1, motion: 1, flow: 2 };
 export const BLUR = 0.3; // pixels^2 added to 2D variances, as `render` does
+const NEAREST = 0.01; // z-depth over that of the near depth: nothing nearer is drawn
 const MAX_FLOW_SHARE = 0.02; // of the picture's width: flow shown in full color
 
 /** A WebGL2 context that can blend half floats; throws a sentence where there is none. */
@@ -154,7 +155,7 @@ export class Renderer {
   }
 
   setCamera({ c2w, K, width, height, blur = BLUR }) {
-    const { splat } = this;
+    const { scene, splat } = this;
     const center = c2w.map((row) => row[3]);
     // columns of world to camera are rows of camera to world
     const rotation = c2w.flatMap((row) => row.slice(0, 3));
@@ -165,6 +166,7 @@ export class Renderer {
     splat.set("u_translation", translation);
     splat.set("u_eye", center);
     splat.set("u_camera", [K[0][0], K[1][1], K[0][2], K[1][2]]);
+    splat.set("u_nearest", NEAREST * scene.near);
     splat.set("u_size", [width, height]);
     splat.set("u_blur", blur);
   }
@@ -296,7 +298,7 @@ class Sorter {
       centers: group.centers?.data,
       logDurations: group.log_durations?.data,
     }));
-    this.worker.postMessage({ groups });
+    this.worker.postMessage({ groups, nearest: NEAREST * scene.near });
   }
 
   sort(time, poses, row) {

@@ -2,16 +2,16 @@
 
 import { POSE_FLOATS } from "./motion.js";
 
-const NEAREST = 0.01; // z-depth, scene units: nothing nearer is drawn
 const MAX_AGE = 2.8; // durations from its center time at which a Gaussian is alive
 const BUCKETS = 65536;
 
 let groups = [];
+let nearest = 0; // z-depth, scene units: nothing nearer is drawn
 let total = 0;
 
 onmessage = ({ data }) => {
   if (data.groups) {
-    groups = data.groups;
+    ({ groups, nearest } = data);
     total = groups.reduce((sum, group) => sum + group.count, 0);
     return;
   }
@@ -37,7 +37,7 @@ function backToFront(time, poses, row) {
   let visible = new Uint32Array(total);
   let count = 0;
   for (let i = total - 1; i >= 0; i--) {
-    if (depths[i] > NEAREST) visible[count++] = i;
+    if (depths[i] > nearest) visible[count++] = i;
   }
   visible = visible.subarray(0, count);
   return sortPass(sortPass(visible, bits, 0), bits, 16);

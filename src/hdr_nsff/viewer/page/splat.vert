@@ -8,7 +8,6 @@ precision highp sampler2DArray;
 
 const int MAX_GROUPS = 4;
 const int WIDTH = 2048; // texels in a row of every table
-const float NEAREST = 0.01; // z-depth, scene units
 const float MARGIN = 0.3; // of half the picture: beyond, the projection is linearized at its edge
 const float MAX_LOG_RADIANCE = 16.0;
 const float MAX_VIEW_LOG_FACTOR = 2.0;
@@ -40,6 +39,7 @@ uniform mat3 u_rotation; // world to camera
 uniform vec3 u_translation;
 uniform vec3 u_eye;
 uniform vec4 u_camera; // fx, fy, cx, cy in pixels
+uniform float u_nearest; // z-depth, scene units: nothing nearer is drawn
 uniform vec2 u_size; // pixels
 uniform float u_blur; // pixels^2 added to 2D variances
 uniform int u_feature;
@@ -96,7 +96,7 @@ vec3 move(vec3 point, int weights, int row, out vec4 turn) {
 }
 
 vec2 project(vec3 t) {
-  return u_camera.xy * t.xy / max(t.z, NEAREST) + u_camera.zw;
+  return u_camera.xy * t.xy / max(t.z, u_nearest) + u_camera.zw;
 }
 
 vec3 radiance(int i, int group, vec3 mean) {
@@ -151,7 +151,7 @@ void main() {
   v_offset = vec2(0.0);
   gl_Position = vec4(0.0, 0.0, 2.0, 1.0); // beyond the far plane: not drawn
   vec3 t = u_rotation * mean + u_translation;
-  if (!(t.z > NEAREST && opacity * 255.0 >= 1.0)) return;
+  if (!(t.z > u_nearest && opacity * 255.0 >= 1.0)) return;
 
   // the 2D covariance V V^T + blur with V = J W R S
   vec2 edge = MARGIN * 0.5 * u_size / u_camera.xy;

@@ -37,12 +37,12 @@ VECTOR = "f1 f1 f1 f1 d0 d0 "  # numbers, gradient, moments; lr, eps
 ROWS = "f2 f2 f2 f2 b1 d0 d0 "  # a table, gradient, moments, marks; lr, eps
 # argument types of the kernels, in order: type and number of dimensions, 0 for a number
 SIGNATURES = {
-    "project": "f2 f2 f2 f1 f2 f2 f2 i0 i0 f2 f1 f2 s2 i1",
+    "project": "f2 f2 f2 f1 f2 f2 f2 i0 i0 d0 f2 f1 f2 s2 i1",
     "list_pairs": "s2 i1 s1 i0 i1 s1",
     "order_pairs": "i1 i1 s1 i1 s1",
     "forward": "i1 s1 f2 f2 f3 f2",
     "backward": "i1 s1 f2 f2 f3 f2 f3 f2 f2 f2",
-    "project_backward": "f2 f2 f2 f1 f2 f2 i0 i0 i1 f2 i0 f2 f2 f2 f1 f2",
+    "project_backward": "f2 f2 f2 f1 f2 f2 i0 i0 d0 i1 f2 i0 f2 f2 f2 f1 f2",
     "cloud": f"{STATIC} {MOVING} f2 f2 f2 {LOCAL} i1 s2 s2 {SIGHT} {CLOUD}",
     "static_backward": f"f2 f2 f1 f2 f3 {SIGHT} {CLOUD} {STATIC}",
     "moving_backward": f"{MOVING} f2 f2 f2 s2 i0 {SIGHT} {CLOUD} {MOVING} f2",

@@ -35,18 +35,19 @@ def read_gaussian(g, means, quaternions, scales):
 
 
 @exact_device
-def read_camera(w2c, K):
-    """World-to-camera matrix (3, 4), row by row, and (fx, fy, cx, cy), in float64."""
+def read_camera(w2c, K, nearest):
+    """World-to-camera matrix (3, 4), row by row, and (fx, fy, cx, cy, nearest)."""
     view = (
         (float64(w2c[0, 0]), float64(w2c[0, 1]), float64(w2c[0, 2]), float64(w2c[0, 3])),
         (float64(w2c[1, 0]), float64(w2c[1, 1]), float64(w2c[1, 2]), float64(w2c[1, 3])),
         (float64(w2c[2, 0]), float64(w2c[2, 1]), float64(w2c[2, 2]), float64(w2c[2, 3])),
     )
-    return view, (float64(K[0, 0]), float64(K[1, 1]), float64(K[0, 2]), float64(K[1, 2]))
+    fx, fy, cx, cy = float64(K[0, 0]), float64(K[1, 1]), float64(K[0, 2]), float64(K[1, 2])
+    return view, (fx, fy, cx, cy, float64(nearest))
 
 
 def project(
-    means, quaternions, scales, opacities, features, w2c, K, width, height,
+    means, quaternions, scales, opacities, features, w2c, K, width, height, nearest,
     ellipses, depths, values, boxes, counts,
 ):  # fmt: skip
     """Project world Gaussians, one thread each, as `projection.project` does.
@@ -59,7 +60,7 @@ def project(
     if g >= means.shape[0]:
         return
     m, q, s = read_gaussian(g, means, quaternions, scales)
-    view, k = read_camera(w2c, K)
+    view, k = read_camera(w2c, K, nearest)
     t, _, _, _, _, covariance = footprint_of(m, q, s, view, k, width, height)
     opacity = float64(opacities[g])
     shows, center, conic, bounds = ellipse_of(t, covariance, opacity, k, width, height)
@@ -123,8 +124,8 @@ def order_pairs(keys, order, owners, starts, ordered):
 
 
 def project_backward(
-    means, quaternions, scales, opacities, w2c, K, width, height, counts, sums, depth_channel,
-    grad_means, grad_quaternions, grad_scales, grad_opacities, grad_view,
+    means, quaternions, scales, opacities, w2c, K, width, height, nearest, counts, sums,
+    depth_channel, grad_means, grad_quaternions, grad_scales, grad_opacities, grad_view,
 ):  # fmt: skip
     """Carry `sums` of `backward` back to the world, one thread per Gaussian.
 
@@ -147,7 +148,7 @@ def project_backward(
                 grad_view[g, n] = ZERO
         return
     m, q, s = read_gaussian(g, means, quaternions, scales)
-    view, k = read_camera(w2c, K)
+    view, k = read_camera(w2c, K, nearest)
     u = (
         float64(sums[g, 0]),
         float64(sums[g, 1]),
