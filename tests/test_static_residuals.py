@@ -1,6 +1,9 @@
 """Residuals against a static scene: zero for points at rest, the motion for others."""
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from painted_clips import FOCAL, SPEED, H, K, T, W, cameras, painted_clip
 from posed_planes import oblique
 
@@ -34,7 +37,8 @@ def test_the_static_residual_is_zero_at_rest_and_the_motion_of_movers():
     assert np.allclose(residual[truth[0]].mean(0), (-4, 0), atol=1e-3)
 
 
-def test_points_at_rest_have_no_residual_before_turned_cameras():
+@pytest.mark.parametrize("unit", [1, 1e-5, 1e5])
+def test_points_at_rest_have_no_residual_before_turned_cameras(unit):
     clip = oblique(5)
     centers = pixel_centers(*clip.size)
     pixels = centers.reshape(-1, 2)
@@ -44,7 +48,10 @@ def test_points_at_rest_have_no_residual_before_turned_cameras():
     for frame, links in ((3, 1), (4, 2), (1, 1), (0, 2)):
         seen = clip.project(frame, world)[0].reshape(centers.shape)
         chains.append(ChainedFlow(frame, links, (seen - centers).astype(np.float32), everywhere))
-    assert np.abs(static_residual(2, chains, clip.K, clip.c2w)).max() < 1e-3
+    c2w = clip.c2w * [1, 1, 1, unit]
+    assert np.abs(static_residual(2, chains, clip.K, c2w)).max() < 1e-3
+    unsure = [replace(chained, valid=~everywhere) for chained in chains]
+    assert np.abs(static_residual(2, unsure, clip.K, c2w)).max() < 1e-3
 
 
 def test_the_epipolar_residual_leads_to_the_line():

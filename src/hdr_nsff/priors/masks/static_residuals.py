@@ -22,6 +22,7 @@ from hdr_nsff.priors.masks.geometric_tuning import GEOMETRIC_MASK_TUNING, Geomet
 from hdr_nsff.priors.poses.rotation import epipolar, homography
 from hdr_nsff.radiometry.common_range import LUMA
 
+TINY = float(np.finfo(np.float32).tiny)  # a divisor that is 0: whatever the unit of length
 SAMPLING = 4  # pixels: matches are taken on every fourth column of every fourth row
 Links = dict[int, tuple[int, int]]  # frame -> (pair, other frame)
 
@@ -237,7 +238,7 @@ def static_residual(
     square = np.sum(slope**2, -1)
     weight = trust
     for _ in range(tuning.depth_iterations):
-        rho = -np.sum(weight * product, 0) / (np.sum(weight * square, 0) + 1e-9)
+        rho = -np.sum(weight * product, 0) / (np.sum(weight * square, 0) + TINY)
         rho = np.maximum(rho, 0)
         residual = slope * rho[..., None] + offset
         weight = trust / (1 + np.sum(residual**2, -1) / tuning.robust_px**2)
