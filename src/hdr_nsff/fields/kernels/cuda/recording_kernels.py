@@ -25,8 +25,7 @@ from hdr_nsff.geometry.pinhole import MIN_DEPTH
 pixel_of_point = device_functions(moment, fastmath=False, arrays=True)["pixel_of_point"]
 background_radiance = device_functions(pixel, fastmath=False, arrays=True)["background_radiance"]
 CURVES = 3 * MAX_KNOTS
-GAIN, LENS, SHARE = 0, 3, 6  # positions in shared sums (SUMS,)
-SUMS = 7
+SUMS = 6  # gradients of gain and lens, three numbers each
 
 
 @exact_device
@@ -123,6 +122,31 @@ def passed(r2, vignetting, camera_id, least):
 
 
 @exact_device
+def channel_gradients(r, d, light, c, gain, curve, knots, leaky, leak, curves):
+    """Gradients of radiance r in channel c, of gain and of the share of light, where
+    that of what is recorded is d; adds the curve's to shared `curves` (CURVES,).
+    """
+    g = exposure_gradient(r * light * gain[c], d, c, curve, knots, leaky, leak, curves)
+    return g * light * gain[c], g * light * r, g * gain[c] * r
+
+
+@exact_device
+def add_at(sums, c, value):
+    """`sums` (3,) with a value added to number c."""
+    red = sums[0] + (value if c == 0 else 0.0)
+    green = sums[1] + (value if c == 1 else 0.0)
+    return red, green, sums[2] + (value if c == 2 else 0.0)
+
+
+@exact_device
+def add_lens(sums, d, r2, vignetting, camera_id, least):
+    """`sums` (3,) with the gradients of a lens added, where that of its share is d."""
+    if vignetting.shape[0] == 0 or transmission(r2, vignetting[camera_id]) < least:
+        return sums
+    return sums[0] + d * r2, sums[1] + d * r2 * r2, sums[2] + d * r2 * r2 * r2
+
+
+@exact_device
 def clear(curves, sums):
     """Shared sums start at 0."""
     thread = cuda.threadIdx.x
@@ -134,23 +158,19 @@ def clear(curves, sums):
 
 
 @exact_device
-def add_lens(d, r2, vignetting, camera_id, least, sums):
-    """Add the gradients of a lens to shared `sums`, where that of its share is d."""
-    if vignetting.shape[0] > 0 and transmission(r2, vignetting[camera_id]) >= least:
-        cuda.atomic.add(sums, LENS, float32(d * r2))
-        cuda.atomic.add(sums, LENS + 1, float32(d * r2 * r2))
-        cuda.atomic.add(sums, LENS + 2, float32(d * r2 * r2 * r2))
-
-
-@exact_device
-def give(curves, sums, camera_id, g_gain, g_curve, g_vignetting):
-    """Add shared sums to gradients of gain (3,), curve (3, K) and lenses (C, 3)."""
+def give(curves, of_gain, of_lens, sums, camera_id, g_gain, g_curve, g_vignetting):
+    """Add the sums of a block's threads to the gradients of gain (3,), curve (3, K) and
+    lenses (C, 3); `of_gain` (3,) and `of_lens` (3,) are one thread's.
+    """
     thread = cuda.threadIdx.x
+    for n in range(3):
+        cuda.atomic.add(sums, n, float32(of_gain[n]))
+        cuda.atomic.add(sums, 3 + n, float32(of_lens[n]))
     cuda.syncthreads()
     if thread < 3:
-        cuda.atomic.add(g_gain, thread, sums[GAIN + thread])
+        cuda.atomic.add(g_gain, thread, sums[thread])
         if g_vignetting.shape[0] > 0:
-            cuda.atomic.add(g_vignetting, (camera_id, thread), sums[LENS + thread])
+            cuda.atomic.add(g_vignetting, (camera_id, thread), sums[3 + thread])
     for c in range(3):
         for k in range(thread, g_curve.shape[1], THREADS):
             cuda.atomic.add(g_curve, (c, k), curves[c * MAX_KNOTS + k])
@@ -184,26 +204,26 @@ def photograph_backward(
     curves = cuda.shared.array(CURVES, float32)
     sums = cuda.shared.array(SUMS, float32)
     clear(curves, sums)
+    of_gain = of_lens = (0.0, 0.0, 0.0)
     for i in range(cuda.grid(1), radiance.shape[0], cuda.gridDim.x * THREADS):
         r2 = radius_of_pixel(i, pixels, K, vignetting, corners, camera_id)
         light = passed(r2, vignetting, camera_id, least)
         d_light = d_share = 0.0
         for c in range(3):
             r, d = radiance[i, c], float(d_rgb[i, c])
-            x = r * light * gain[c]
             if late.shape[0] > 0:
-                share = late_share[i, 0]
+                share, x = late_share[i, 0], r * light * gain[c]
                 d_share += d * (late[i, c] - recorded(x, c, curve, knots, leaky, leak))
                 g_late[i, c] = d * share
                 d -= d * share
-            g = exposure_gradient(x, d, c, curve, knots, leaky, leak, curves)
-            g_radiance[i, c] = g * light * gain[c]
-            cuda.atomic.add(sums, GAIN + c, float32(g * light * r))
-            d_light += g * gain[c] * r
+            g = channel_gradients(r, d, light, c, gain, curve, knots, leaky, leak, curves)
+            g_radiance[i, c] = g[0]
+            of_gain = add_at(of_gain, c, g[1])
+            d_light += g[2]
         if late.shape[0] > 0:
             g_late_share[i, 0] = d_share
-        add_lens(d_light, r2, vignetting, camera_id, least, sums)
-    give(curves, sums, camera_id, g_gain, g_curve, g_vignetting)
+        of_lens = add_lens(of_lens, d_light, r2, vignetting, camera_id, least)
+    give(curves, of_gain, of_lens, sums, camera_id, g_gain, g_curve, g_vignetting)
 
 
 def record_parts(
@@ -238,26 +258,25 @@ def record_parts_backward(
     sums = cuda.shared.array(SUMS, float32)
     clear(curves, sums)
     count, num_features = features.shape[0], features.shape[1]
+    of_gain = of_lens = (0.0, 0.0, 0.0)
     for i in range(cuda.grid(1), count + 1, cuda.gridDim.x * THREADS):
-        if i == count:
-            radiance, slope = background_radiance(background, bounded)
-            for c in range(3):
-                x = radiance[c] * gain[c]
-                g = exposure_gradient(x, d_behind[c], c, curve, knots, leaky, leak, curves)
-                cuda.atomic.add(g_background, c, float32(g * gain[c] * slope[c]))
-                cuda.atomic.add(sums, GAIN + c, float32(g * radiance[c]))
-            continue
-        for n in range(num_features):
-            g_features[i, n] = d_made[i, n]
-        r2 = radius_of_mean(i, means, K, c2w, width, height, vignetting, corners, camera_id)
-        light = passed(r2, vignetting, camera_id, least)
-        d_light = 0.0
+        behind, slope = background_radiance(background, bounded)
+        r2, light, d_light = 0.0, 1.0, 0.0
+        if i < count:
+            r2 = radius_of_mean(i, means, K, c2w, width, height, vignetting, corners, camera_id)
+            light = passed(r2, vignetting, camera_id, least)
+            for n in range(num_features):
+                g_features[i, n] = d_made[i, n]
         for c in range(3):
-            r, d = features[i, c], d_made[i, num_features + c]
-            x = r * light * gain[c]
-            g = exposure_gradient(x, d, c, curve, knots, leaky, leak, curves)
-            g_features[i, c] += g * light * gain[c]
-            cuda.atomic.add(sums, GAIN + c, float32(g * light * r))
-            d_light += g * gain[c] * r
-        add_lens(d_light, r2, vignetting, camera_id, least, sums)
-    give(curves, sums, camera_id, g_gain, g_curve, g_vignetting)
+            r = float(features[i, c]) if i < count else behind[c]
+            d = float(d_made[i, num_features + c] if i < count else d_behind[c])
+            g = channel_gradients(r, d, light, c, gain, curve, knots, leaky, leak, curves)
+            if i < count:
+                g_features[i, c] += g[0]
+            else:
+                cuda.atomic.add(g_background, c, float32(g[0] * slope[c]))
+            of_gain = add_at(of_gain, c, g[1])
+            d_light += g[2]
+        if i < count:
+            of_lens = add_lens(of_lens, d_light, r2, vignetting, camera_id, least)
+    give(curves, of_gain, of_lens, sums, camera_id, g_gain, g_curve, g_vignetting)
