@@ -269,6 +269,22 @@ def test_launches_of_a_step_of_grid(
     assert [counts.launches[kind] for kind in kinds] == [7, 7, 3]
 
 
+@pytest.mark.parametrize("preset", ["paper-small", "hdr-hexplane", "nerf-wt", "nsff-paper-small"])
+def test_adam_takes_what_every_field_learns(
+    preset: str,
+    toy: Scene,
+    toy_folder: Path,
+    tmp_path: Path,
+    device: torch.device,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    launch_by(monkeypatch, count_launch)
+    trainer = trainer_on(device, toy, toy_folder, tmp_path / "run", preset)
+    with counted() as counts:
+        trainer.step()
+    assert counts.launches["adam"] >= 1
+
+
 def test_launches_of_the_rasterizer(device: torch.device) -> None:
     parts = (3, 4, 3, 1, 6)
     gaussians = [torch.ones(1, n, device=device).requires_grad_() for n in parts]
