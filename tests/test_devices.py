@@ -181,7 +181,7 @@ STEP_COSTS = {"splat": (842, 0), "splat-late": (1154, 0), "grid": (7700, 25), "p
 
 def flat_picture(*arguments: Any) -> Maps:
     """Maps that depend on all Gaussians, by as few operations as possible."""
-    means, quaternions, scales, opacities, features, view = arguments
+    means, quaternions, scales, opacities, features, view, _ = arguments
     size = view.height, view.width
     shapes = sum(t.mean() for t in (means, quaternions, scales)) * 1e-6
     alpha = (opacities.mean() + shapes).clamp(0.1, 0.9).expand(*size)
