@@ -159,18 +159,27 @@ SPLAT, SPLAT_LOCAL, RASTERIZER, GRID = 21, 24, 10, 948
 LATE_MIXING = 5
 
 
-@pytest.mark.parametrize("late_mixing", [False, True])
-def test_launches_of_a_step(
-    late_mixing: bool,
+@pytest.fixture
+def counting(
     toy: Scene,
     toy_folder: Path,
     tmp_path: Path,
     device: torch.device,
     monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    assert SPLAT_LOCAL + LATE_MIXING + RASTERIZER <= 40
+) -> Callable[..., Trainer]:
+    """Makes a trainer whose kernels are counted, and do nothing."""
     launch_by(monkeypatch, count_launch)
-    trainer = trainer_on(device, toy, toy_folder, tmp_path / "run", late_mixing=late_mixing)
+
+    def make(preset: str = "splat", **settings: bool | int) -> Trainer:
+        return trainer_on(device, toy, toy_folder, tmp_path / "run", preset, **settings)
+
+    return make
+
+
+@pytest.mark.parametrize("late_mixing", [False, True])
+def test_launches_of_a_step(late_mixing: bool, counting: Callable[..., Trainer]) -> None:
+    assert SPLAT_LOCAL + LATE_MIXING + RASTERIZER <= 40
+    trainer = counting(late_mixing=late_mixing)
     most = SPLAT + late_mixing * LATE_MIXING
     for number, step in enumerate((1, 2, 1, 2)):  # constants are there by the second time
         trainer.clock = replace(trainer.clock, step=step)
@@ -231,16 +240,9 @@ def test_a_step_moves_the_poses_near_the_knot_as_on_the_cpu(
 
 @pytest.mark.parametrize("late_mixing", [False, True])
 def test_launches_of_a_step_with_time_local_gaussians(
-    late_mixing: bool,
-    toy: Scene,
-    toy_folder: Path,
-    tmp_path: Path,
-    device: torch.device,
-    monkeypatch: pytest.MonkeyPatch,
+    late_mixing: bool, counting: Callable[..., Trainer]
 ) -> None:
-    launch_by(monkeypatch, count_launch)
-    settings = {"local": 9, "late_mixing": late_mixing}
-    trainer = trainer_on(device, toy, toy_folder, tmp_path / "run", **settings)
+    trainer = counting(local=9, late_mixing=late_mixing)
     most = SPLAT_LOCAL + late_mixing * LATE_MIXING
     assert len(trainer.field.local) == 9
     for step in (1, 2, 1, 2):
@@ -252,15 +254,8 @@ def test_launches_of_a_step_with_time_local_gaussians(
     assert set(counts.waits) == {"aten.nonzero.default"}  # the number of those alive
 
 
-def test_launches_of_a_step_of_grid(
-    toy: Scene,
-    toy_folder: Path,
-    tmp_path: Path,
-    device: torch.device,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    launch_by(monkeypatch, count_launch)
-    trainer = trainer_on(device, toy, toy_folder, tmp_path / "run", "grid")
+def test_launches_of_a_step_of_grid(counting: Callable[..., Trainer]) -> None:
+    trainer = counting("grid")
     for _ in range(2):
         with counted() as counts:
             trainer.step()
@@ -270,16 +265,8 @@ def test_launches_of_a_step_of_grid(
 
 
 @pytest.mark.parametrize("preset", ["paper-small", "hdr-hexplane", "nerf-wt", "nsff-paper-small"])
-def test_adam_takes_what_every_field_learns(
-    preset: str,
-    toy: Scene,
-    toy_folder: Path,
-    tmp_path: Path,
-    device: torch.device,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    launch_by(monkeypatch, count_launch)
-    trainer = trainer_on(device, toy, toy_folder, tmp_path / "run", preset)
+def test_adam_takes_what_every_field_learns(preset: str, counting: Callable[..., Trainer]) -> None:
+    trainer = counting(preset)
     with counted() as counts:
         trainer.step()
     assert counts.launches["adam"] >= 1
