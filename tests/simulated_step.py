@@ -17,6 +17,7 @@ from simulated_tone import use_few_knots
 from torch import Tensor
 
 from hdr_nsff.core import distributed
+from hdr_nsff.fields.kernels.cuda import launch as launching
 from hdr_nsff.fields.kernels.cuda.launch import check_arguments, launch
 from hdr_nsff.fields.nsff import encodings, fused_grid
 from hdr_nsff.fields.splat import (
@@ -122,8 +123,7 @@ def device(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
     """The pretend device, on which our kernels run."""
     launch_by(monkeypatch, launch_there)
     use_few_knots(monkeypatch)
-    for module in (fused_parts, fused_picture, photograph_cuda, fused_losses):
-        monkeypatch.setattr(module, "MAX_BLOCKS", 2)
+    monkeypatch.setattr(launching, "MAX_BLOCKS", 2)
     for module in (draw, training_view):
         monkeypatch.setattr(module, "rasterize", draw_nothing)
     monkeypatch.setattr(training_view, "rasterize_planes", draw_no_planes)

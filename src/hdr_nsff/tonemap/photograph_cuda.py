@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from hdr_nsff.fields.kernels.cuda.launch import blocks_for, few_zeros, launch
-from hdr_nsff.fields.kernels.cuda.layout import MAX_BLOCKS, MAX_KNOTS, THREADS
+from hdr_nsff.fields.kernels.cuda.launch import blocks_for, few_blocks, few_zeros, launch
+from hdr_nsff.fields.kernels.cuda.layout import MAX_KNOTS, THREADS
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.batch import Sensor
 
@@ -68,7 +68,7 @@ class Photograph(torch.autograd.Function):
     def backward(ctx: Any, d_rgb: Tensor) -> Any:
         made = [torch.empty_like(t) for t in ctx.given[:3]]
         sums = [few_zeros(d_rgb, *shape) for shape in ctx.sums]
-        grid = min(blocks_for(len(d_rgb))[0], MAX_BLOCKS), 1
+        grid = few_blocks(len(d_rgb))
         given = *ctx.given, d_rgb.contiguous()
         launch("photograph_backward", grid, THREADS, *given, *made, *sums)
         return *made, *sums, None, None, None

@@ -14,8 +14,8 @@ from torch.autograd.function import once_differentiable
 from hdr_nsff.core.tensors import by_channel
 from hdr_nsff.fields.base import Render
 from hdr_nsff.fields.kernels import picture as kernels
-from hdr_nsff.fields.kernels.cuda.launch import blocks_for, few_zeros, launch
-from hdr_nsff.fields.kernels.cuda.layout import MAX_BLOCKS, PICTURE_SUMS, THREADS
+from hdr_nsff.fields.kernels.cuda.launch import blocks_for, few_blocks, few_zeros, launch
+from hdr_nsff.fields.kernels.cuda.layout import PICTURE_SUMS, THREADS
 from hdr_nsff.fields.splat.cuda_backends import kernels_on
 from hdr_nsff.maths.losses import MASK_MARGIN
 from hdr_nsff.scene.batch import PixelBatch
@@ -99,7 +99,7 @@ class CudaLosses(torch.autograd.Function):
         sums = few_zeros(rgb, PICTURE_SUMS)
         # `detach`: a result itself would hold on to its own graph
         ctx.given = *(t.detach().contiguous() for t in tensors), *numbers, sums.detach()
-        grid = min(blocks_for(len(rgb))[0], MAX_BLOCKS), 1
+        grid = few_blocks(len(rgb))
         launch("losses", grid, THREADS, *ctx.given)
         return sums
 

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from hdr_nsff.fields.kernels.cuda.launch import blocks_for, few_zeros, launch
-from hdr_nsff.fields.kernels.cuda.layout import MAX_BLOCKS, MAX_KNOTS, THREADS
+from hdr_nsff.fields.kernels.cuda.launch import blocks_for, few_blocks, few_zeros, launch
+from hdr_nsff.fields.kernels.cuda.layout import MAX_KNOTS, THREADS
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.batch import Sensor
 
@@ -69,6 +69,6 @@ class RecordParts(torch.autograd.Function):
         g_features = torch.empty_like(features)
         sums = [few_zeros(features, *shape) for shape in ctx.sums]
         given = *ctx.given, *(g.contiguous() for g in grads)
-        grid = min(blocks_for(len(features) + 1)[0], MAX_BLOCKS), 1
+        grid = few_blocks(len(features) + 1)
         launch("record_parts_backward", grid, THREADS, *given, g_features, *sums)
         return g_features, *sums, None, None, None, None

@@ -12,8 +12,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from hdr_nsff.fields.base import Render
-from hdr_nsff.fields.kernels.cuda.launch import blocks_for, few_zeros, launch
-from hdr_nsff.fields.kernels.cuda.layout import MAX_BLOCKS, THREADS
+from hdr_nsff.fields.kernels.cuda.launch import blocks_for, few_blocks, few_zeros, launch
+from hdr_nsff.fields.kernels.cuda.layout import THREADS
 from hdr_nsff.fields.splat.rasterize import Maps
 
 
@@ -80,6 +80,6 @@ class Compose(torch.autograd.Function):
         made = [torch.empty_like(t) for t in (planes, depths, alphas)]
         sums = [few_zeros(t, len(t)) for t in (background, behind, share)]
         given = *ctx.given, *(g.contiguous() for g in grads)
-        grid = min(blocks_for(len(alphas))[0], MAX_BLOCKS), 1
+        grid = few_blocks(len(alphas))
         launch("compose_backward", grid, THREADS, *given, *made, *sums)
         return *made, *sums, None, None

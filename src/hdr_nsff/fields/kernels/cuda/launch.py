@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from hdr_nsff.fields.kernels.cuda.compile import SIGNATURES, kernel_function, load_kernel
-from hdr_nsff.fields.kernels.cuda.layout import THREADS
+from hdr_nsff.fields.kernels.cuda.layout import MAX_BLOCKS, THREADS
 
 # the driver's keys of a launch's extra values (CU_LAUNCH_PARAM_...)
 BUFFER_END, BUFFER_POINTER, BUFFER_SIZE = 0, 1, 2
@@ -77,6 +77,11 @@ def kinds_of(name: str) -> list[tuple[torch.dtype, int]]:
 def blocks_for(count: int) -> tuple[int, int]:
     """The grid of a kernel with a thread for each of `count`, THREADS in a block."""
     return -(-count // THREADS), 1
+
+
+def few_blocks(count: int) -> tuple[int, int]:
+    """The grid of a kernel whose threads take several of `count`, if there are many."""
+    return min(blocks_for(count)[0], MAX_BLOCKS), 1
 
 
 ZEROS = 2**18  # numbers that are cleared at a time, and then given out in small parts
