@@ -5,6 +5,7 @@ from posed_planes import H, W, oblique
 
 from hdr_nsff.geometry.pinhole import pixel_centers
 from hdr_nsff.priors.depth.plane_sweep import (
+    LEFT_OUT,
     OUTSIDE,
     PlaneSweepTuning,
     aggregate,
@@ -38,9 +39,11 @@ def test_a_frame_is_read_where_a_turned_camera_sees_the_pixels():
 
 
 def test_only_the_best_three_quarters_of_the_views_count():
-    costs = np.array([0.9, 0.1, 0.3, 0.2], np.float32)
-    assert np.isclose(mean_of_lowest(costs, 4, TUNING.best_view_share), 0.2)
-    assert mean_of_lowest(np.zeros(2, np.float32), 0, TUNING.best_view_share) == 1.0
+    """All of the first pixel, three of the second, none of the third."""
+    costs = np.array([[0.9, 0.1, 0.3, 0.2], [0.8, LEFT_OUT, 0.2, 0.5], [LEFT_OUT] * 4], np.float32)
+    mean = np.empty(3, np.float32)
+    mean_of_lowest(np.ascontiguousarray(costs.T), TUNING.best_view_share, mean)
+    np.testing.assert_allclose(mean, [0.2, 0.5, 1.0])
 
 
 def test_matching_is_smooth_where_all_costs_are_equal():

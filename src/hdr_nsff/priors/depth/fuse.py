@@ -56,6 +56,42 @@ def warp_disparity(disparity, weight, rotation, shift, warped, warped_weight):
 
 
 @jit(nogil=True, fastmath=True)
+def weighted_median(values, weights, total):
+    """The lowest of the `values` (n,) up to which half of the `total` of their
+    `weights` (n,) lies. Both are reordered.
+
+    Values are parted around one of them, and the part with the median once more, until
+    one is left (Hoare's selection, with weights in place of numbers of values).
+    """
+    low, high = 0, len(values) - 1
+    below = np.float32(0)  # weight of the values before `low`
+    while low < high:
+        pivot = values[(low + high) // 2]
+        i, j, left = low, high, np.float32(0)  # weight of the values from `low` to before `i`
+        while i <= j:
+            while values[i] < pivot:
+                left += weights[i]
+                i += 1
+            while values[j] > pivot:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                weights[i], weights[j] = weights[j], weights[i]
+                left += weights[i]
+                i += 1
+                j -= 1
+        between = weights[i - 1] if j < i - 1 else np.float32(0)  # of one equal to the pivot
+        if below + left - between >= 0.5 * total:
+            high = j
+        elif below + left >= 0.5 * total:
+            return pivot
+        else:
+            below += left
+            low = i
+    return values[min(low, len(values) - 1)]
+
+
+@jit(nogil=True, fastmath=True)
 def vote(disparities, weights, max_difference):
     """Weighted median over `n` maps (n, H, W), averaged over those within the share
     `max_difference` of it.
@@ -63,23 +99,19 @@ def vote(disparities, weights, max_difference):
     Returns disparity (H, W), the weight that agrees (H, W), and the weight of all.
     """
     n, height, width = disparities.shape
+    values, shares = np.empty(n, np.float32), np.empty(n, np.float32)
     fused = np.zeros((height, width), np.float32)
     agreeing_weight = np.zeros((height, width), np.float32)
     total_weight = np.zeros((height, width), np.float32)
     for y in range(height):
         for x in range(width):
-            order = np.argsort(disparities[:, y, x])
             total = np.float32(0)
             for i in range(n):
-                total += weights[i, y, x]
+                values[i], shares[i] = disparities[i, y, x], weights[i, y, x]
+                total += shares[i]
             if total <= 0:
                 continue
-            median, running = np.float32(0), np.float32(0)
-            for i in order:
-                running += weights[i, y, x]
-                if running >= 0.5 * total:
-                    median = disparities[i, y, x]
-                    break
+            median = weighted_median(values, shares, total)
             mean, agreeing = np.float32(0), np.float32(0)
             for i in range(n):
                 difference = abs(disparities[i, y, x] - median)
@@ -103,8 +135,13 @@ def joint_median(disparity, weight, rgb, radius, rgb_scale):
     """
     height, width = disparity.shape
     result = disparity.copy()
-    values = np.empty((2 * radius + 1) ** 2, np.float32)
-    weights = np.empty((2 * radius + 1) ** 2, np.float32)
+    side = 2 * radius + 1
+    values, weights = np.empty(side**2, np.float32), np.empty(side**2, np.float32)
+    distances = np.empty((side, side), np.float32)  # of the window's pixels, squared
+    for v in range(side):
+        for u in range(side):
+            distances[v, u] = ((v - radius) ** 2 + (u - radius) ** 2) / (2.0 * radius**2)
+    per_rgb = np.float32(1 / rgb_scale)
     for y in range(height):
         for x in range(width):
             n, total = 0, np.float32(0)
@@ -113,17 +150,11 @@ def joint_median(disparity, weight, rgb, radius, rgb_scale):
                     difference = np.float32(0)
                     for c in range(3):
                         difference += abs(rgb[y, x, c] - rgb[v, u, c])
-                    distance = ((v - y) ** 2 + (u - x) ** 2) / (2.0 * radius**2)
+                    distance = distances[v - y + radius, u - x + radius]
                     values[n] = disparity[v, u]
-                    weights[n] = weight[v, u] * np.exp(-difference / rgb_scale - distance)
+                    weights[n] = weight[v, u] * np.exp(-difference * per_rgb - distance)
                     total += weights[n]
                     n += 1
-            if total <= 0:
-                continue
-            running = np.float32(0)
-            for k in np.argsort(values[:n]):
-                running += weights[k]
-                if running >= 0.5 * total:
-                    result[y, x] = values[k]
-                    break
+            if total > 0:
+                result[y, x] = weighted_median(values[:n], weights[:n], total)
     return result

@@ -10,6 +10,7 @@ thread per frame.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -20,6 +21,7 @@ from hdr_nsff.radiometry.common_range import LUMA
 from hdr_nsff.scene.posed_video import PosedVideo
 
 UNKNOWN_COST = 1.0  # where no view contributes: no correlation
+LEFT_OUT = np.float32(9)  # above every cost
 # what a pixel shows, see `obstacle_map`
 STATIC, MOVING = 0, 1
 CLIPPED, OUTSIDE = 2, 3
@@ -77,69 +79,139 @@ def box(image, radius, result):
         result[y] = totals / np.float32(n)
 
 
-@jit(nogil=True, fastmath=True)
+@jit(nogil=True, fastmath=True, error_model="numpy")
 def warp(image, obstacles, rotation, shift, disparity, warped, met):
     """`image` (H, W) read, bilinearly, where the pixels of the first frame fall if all
     lie at `disparity`, into `warped`; the `obstacles` there, or `OUTSIDE`, into `met`.
     """
     height, width = image.shape
+    right, bottom = np.float32(width - 1), np.float32(height - 1)
+    half = np.float32(0.5)
+    step_x, step_y = np.float32(rotation[0, 0]), np.float32(rotation[1, 0])
+    step_q = np.float32(rotation[2, 0])
+    column = np.empty(met.shape[1], np.float32)
+    row = np.empty(met.shape[1], np.float32)
     for y in range(met.shape[0]):
-        for x in range(met.shape[1]):
-            u, v = x + 0.5, y + 0.5
-            q = rotation[2, 0] * u + rotation[2, 1] * v + rotation[2, 2] + disparity * shift[2]
-            qx = rotation[0, 0] * u + rotation[0, 1] * v + rotation[0, 2] + disparity * shift[0]
-            qy = rotation[1, 0] * u + rotation[1, 1] * v + rotation[1, 2] + disparity * shift[1]
-            px = qx / q - 0.5
-            py = qy / q - 0.5
-            inside = q > 1e-6 and px >= 0 and py >= 0 and px <= width - 1 and py <= height - 1
-            if not inside:
-                px = min(max(px, 0.0), width - 1.0)
-                py = min(max(py, 0.0), height - 1.0)
-            x0, y0 = min(int(px), width - 2), min(int(py), height - 2)
-            fx, fy = np.float32(px - x0), np.float32(py - y0)
-            top = image[y0, x0] + fx * (image[y0, x0 + 1] - image[y0, x0])
-            bottom = image[y0 + 1, x0] + fx * (image[y0 + 1, x0 + 1] - image[y0 + 1, x0])
-            warped[y, x] = top + fy * (bottom - top)
-            met[y, x] = obstacles[int(py + 0.5), int(px + 0.5)] if inside else OUTSIDE
+        # where the row's first pixel falls, homogeneous, in units of its depth
+        u, v = 0.5, y + 0.5
+        first = rotation[:, 0] * u + rotation[:, 1] * v + rotation[:, 2] + disparity * shift
+        first_x, first_y = np.float32(first[0]), np.float32(first[1])
+        first_q = np.float32(first[2])
+        for x in range(len(column)):
+            q = first_q + np.float32(x) * step_q
+            column[x] = (first_x + np.float32(x) * step_x) / q - half
+            if q <= np.float32(1e-6):
+                column[x] = -1  # outside
+        for x in range(len(row)):
+            q = first_q + np.float32(x) * step_q
+            row[x] = (first_y + np.float32(x) * step_y) / q - half
+        for x in range(len(row)):
+            px, py = column[x], row[x]
+            inside = px >= 0 and py >= 0 and px <= right and py <= bottom
+            px = min(max(px, np.float32(0)), right)
+            py = min(max(py, np.float32(0)), bottom)
+            # unsigned: numba takes negative indices for counted from the end
+            x0, y0 = np.uint64(min(px, right - 1)), np.uint64(min(py, bottom - 1))
+            x1, y1 = x0 + np.uint64(1), y0 + np.uint64(1)
+            fx, fy = px - np.float32(x0), py - np.float32(y0)
+            upper = image[y0, x0] + fx * (image[y0, x1] - image[y0, x0])
+            lower = image[y1, x0] + fx * (image[y1, x1] - image[y1, x0])
+            warped[y, x] = upper + fy * (lower - upper)
+            found = obstacles[np.uint64(py + half), np.uint64(px + half)]
+            met[y, x] = found if inside else OUTSIDE
 
 
-@jit(nogil=True, fastmath=True)
-def correlation_cost(gray, mean, square, other, radius, noise_variance, scratch, result):
+@jit(nogil=True, fastmath=True, error_model="numpy")
+def correlation_cost(gray, mean, square, other, radius, noise_variance, result):
     """1 - normalized cross-correlation of two images over the window, per pixel, into
     `result`; in [0, 2].
 
-    `mean`, `square` (H, W): means of `gray` and of its square; `scratch` (3, H, W).
+    `mean`, `square` (H, W): means of `gray` and of its square. Sums go along columns,
+    then along rows, each in a loop of its own, which the compiler does many pixels at a
+    time.
     """
-    other_mean, other_square, product = scratch
-    box(other, radius, other_mean)
-    box(other * other, radius, other_square)
-    box(gray * other, radius, product)
-    for y in range(gray.shape[0]):
-        for x in range(gray.shape[1]):
-            variance = square[y, x] - mean[y, x] ** 2 + noise_variance
-            other_variance = other_square[y, x] - other_mean[y, x] ** 2 + noise_variance
-            covariance = product[y, x] - mean[y, x] * other_mean[y, x]
-            result[y, x] = 1.0 - covariance / np.sqrt(variance * other_variance)
+    height, width = gray.shape
+    columns = np.zeros((3, width + 2 * radius), np.float32)  # of rows y - radius to y + radius
+    sums = np.empty((3, width), np.float32)  # over the window: other, its square, the product
+    share = 1 / window_counts(width, radius)  # of a pixel among those of a window's row
+    noise = np.float32(noise_variance)
+    for y in range(-radius, height):
+        if y + radius < height:
+            add_row(columns, gray[y + radius], other[y + radius], np.float32(1), radius)
+        if y - radius > 0:
+            add_row(columns, gray[y - radius - 1], other[y - radius - 1], np.float32(-1), radius)
+        if y < 0:
+            continue
+        for i in range(3):
+            total = sums[i]
+            total[:] = 0
+            for k in range(2 * radius + 1):
+                shifted = columns[i, k : k + width]
+                for x in range(width):
+                    total[x] += shifted[x]
+        rows = min(y, radius) + min(height - 1 - y, radius) + 1
+        other_sum, square_sum, product_sum = sums
+        for x in range(width):
+            each = share[x] / np.float32(rows)
+            other_mean = other_sum[x] * each
+            variance = square[y, x] - mean[y, x] * mean[y, x] + noise
+            other_variance = square_sum[x] * each - other_mean * other_mean + noise
+            covariance = product_sum[x] * each - mean[y, x] * other_mean
+            # math's root, unlike numpy's, is taken of many pixels at a time
+            result[y, x] = 1 - covariance / math.sqrt(variance * other_variance)
 
 
 @jit(nogil=True, fastmath=True)
-def mean_of_lowest(values, n, share):
-    """Mean of the lowest `share` of the first `n` values, which are sorted in place;
-    `UNKNOWN_COST` if there are none.
+def window_counts(size, radius):
+    """How many pixels of a row (`size`,) are within `radius` of each."""
+    counts = np.empty(size, np.float32)
+    for x in range(size):
+        counts[x] = min(x, radius) + min(size - 1 - x, radius) + 1
+    return counts
+
+
+@jit(nogil=True, fastmath=True)
+def add_row(columns, gray, other, sign, radius):
+    """Add a row (W,) of two images to the sums `columns` (3, W + 2 `radius`), or, with
+    the `sign` -1, take it away.
     """
-    if n == 0:
-        return np.float32(UNKNOWN_COST)
-    for i in range(1, n):
-        value, j = values[i], i - 1
-        while j >= 0 and values[j] > value:
-            values[j + 1] = values[j]
-            j -= 1
-        values[j + 1] = value
-    count = max(1, int(np.ceil(share * n)))
-    total = np.float32(0)
-    for i in range(count):
-        total += values[i]
-    return total / np.float32(count)
+    width = len(gray)
+    plain, square, product = columns[:, radius : radius + width]
+    for x in range(width):
+        plain[x] += sign * other[x]
+    for x in range(width):
+        square[x] += sign * (other[x] * other[x])
+    for x in range(width):
+        product[x] += sign * (gray[x] * other[x])
+
+
+@jit(nogil=True, fastmath=True, error_model="numpy")
+def mean_of_lowest(values, share, result):
+    """Mean of the lowest `share` of the `values` (n, W) of each column, into `result`
+    (W,); those that are `LEFT_OUT` do not count. `UNKNOWN_COST` where none is left.
+
+    They are sorted in place, all columns at a time.
+    """
+    n, width = values.shape
+    lowest = np.zeros(width, np.float32)  # how many count, of these the lowest share
+    for i in range(n):
+        for x in range(width):
+            lowest[x] += np.float32(1) if values[i, x] < LEFT_OUT else np.float32(0)
+    for x in range(width):
+        lowest[x] = np.ceil(np.float32(share) * lowest[x])
+    for last in range(n - 1, 0, -1):
+        for i in range(last):
+            first, second = values[i], values[i + 1]
+            for x in range(width):
+                a, b = first[x], second[x]
+                first[x] = min(a, b)
+                second[x] = max(a, b)
+    result[:] = 0
+    for i in range(n):
+        for x in range(width):
+            result[x] += values[i, x] if np.float32(i) < lowest[x] else np.float32(0)
+    for x in range(width):
+        result[x] = result[x] / lowest[x] if lowest[x] > 0 else np.float32(UNKNOWN_COST)
 
 
 @jit(nogil=True, fastmath=True)
@@ -155,7 +227,7 @@ def matching_costs(
     noise_variance,
     best_view_share,
 ):
-    """Costs (H, W, D) of each candidate disparity (D,) over `n` views.
+    """Costs (D, H, W) of each candidate disparity (D,) over `n` views.
 
     `grays` (n, H, W): the frame, cut to the range each view recorded too; `others` (n,
     H, W): the views. A view counts for a pixel where its obstacle (n, H, W) is below
@@ -164,39 +236,43 @@ def matching_costs(
     `PlaneSweepTuning`.
     """
     n, height, width = grays.shape
-    costs = np.empty((height, width, len(disparities)), np.float32)
+    costs = np.empty((len(disparities), height, width), np.float32)
     means = np.empty((n, height, width), np.float32)
     squares = np.empty((n, height, width), np.float32)
     for i in range(n):
         box(grays[i], radius, means[i])
         box(grays[i] * grays[i], radius, squares[i])
-    scratch = np.empty((3, height, width), np.float32)
     warped = np.empty((height, width), np.float32)
     cost = np.empty((n, height, width), np.float32)
     met = np.empty((n, height, width), np.uint8)
-    values = np.empty(n, np.float32)
+    values = np.empty((n, width), np.float32)
     for k in range(len(disparities)):
         for i in range(n):
             warp(others[i], obstacles[i], rotations[i], shifts[i], disparities[k], warped, met[i])
             correlation_cost(
-                grays[i],
-                means[i],
-                squares[i],
-                warped,
-                radius,
-                noise_variance,
-                scratch,
-                cost[i],
+                grays[i], means[i], squares[i], warped, radius, noise_variance, cost[i]
             )
         for y in range(height):
-            for x in range(width):
-                count = 0
-                for i in range(n):
-                    if met[i, y, x] < tolerance[i, y, x]:
-                        values[count] = cost[i, y, x]
-                        count += 1
-                costs[y, x, k] = mean_of_lowest(values, count, best_view_share)
+            for i in range(n):
+                for x in range(width):
+                    counts = met[i, y, x] < tolerance[i, y, x]
+                    values[i, x] = cost[i, y, x] if counts else LEFT_OUT
+            mean_of_lowest(values, best_view_share, costs[k, y])
     return costs
+
+
+@jit(nogil=True, fastmath=True)
+def mean_by_pixel(a, b):
+    """The mean (H, W, D) of two arrays (D, H, W): candidates of a pixel go together."""
+    num_candidates, height, width = a.shape
+    result = np.empty((height, width, num_candidates), np.float32)
+    block = 16  # pixels: what they read and write stays in the cache
+    for y in range(height):
+        for start in range(0, width, block):
+            for k in range(num_candidates):
+                for x in range(start, min(start + block, width)):
+                    result[y, x, k] = (a[k, y, x] + b[k, y, x]) / 2
+    return result
 
 
 @jit(nogil=True, fastmath=True)
@@ -264,8 +340,11 @@ def sweep(
     rotations, shifts = [], []
     for j in views:
         low, high = shared_range(clip, i, j)
-        grays.append(np.clip(clip.video[i], low, high) @ LUMA)
-        others.append(np.clip(clip.video[j], low, high) @ LUMA)
+        gray = np.clip(clip.video[i], low, high) @ LUMA
+        # correlations stay the same, but less is lost by rounding on plain walls
+        middle = gray.mean()
+        grays.append(gray - middle)
+        others.append(np.clip(clip.video[j], low, high) @ LUMA - middle)
         # nothing moves between two cameras at one instant
         same_time = bool(clip.times[i] == clip.times[j])
         obstacles.append(obstacle_map(clip, j, same_time))
@@ -318,16 +397,15 @@ def select_disparity(
     """Disparity (H, W), refined between candidates by a parabola, and 1 - its cost (H,
     W), 0 where all candidates cost the same.
 
-    `costs` (H, W, D) of evenly spaced `disparities` (D,); `guide` (H, W) gray. A pixel
+    `costs` (D, H, W) of evenly spaced `disparities` (D,); `guide` (H, W) gray. A pixel
     may also use the best window that still holds it, for sharper edges (Kang et al.
     2001).
     """
     side = 2 * tuning.radius_px + 1
     shifts = np.ones((side, side), np.uint8)
-    by_candidate = [np.ascontiguousarray(c) for c in np.moveaxis(costs, -1, 0)]
-    best_window = np.stack([cv2.erode(c, shifts) for c in by_candidate], -1)
+    best_window = np.stack([cv2.erode(c, shifts) for c in costs])
     total = aggregate(
-        (costs + best_window) / 2,
+        mean_by_pixel(costs, best_window),
         np.ascontiguousarray(guide, np.float32),
         tuning.step_penalty,
         tuning.jump_penalty,
@@ -341,6 +419,6 @@ def select_disparity(
     offset = np.clip((before - after) / (2 * curvature), -1, 1)
     spacing = disparities[1] - disparities[0]
     disparity = disparities[0] + (middle[..., 0] + offset) * spacing
-    matched = np.clip(1 - np.take_along_axis(costs, middle, -1)[..., 0], 0, 1)
-    informative = np.ptp(costs, axis=-1) > 1e-6
+    matched = np.clip(1 - np.take_along_axis(costs, middle[None, ..., 0], 0)[0], 0, 1)
+    informative = np.ptp(costs, axis=0) > 1e-6
     return disparity.astype(np.float32), np.where(informative, matched, 0).astype(np.float32)
