@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from hdr_nsff.priors.movers.bundle_problem import BundleProblem, BundleState, Cameras
 from hdr_nsff.priors.movers.depth_reversal import undo_depth_reversals
@@ -43,10 +42,9 @@ def adjust_bundle(
     """
     visible = (tracks.trust[group.members] > 0).any(0)
     times = times_of_solution(visible, tuning.max_gap_times)
-    with threadpool_limits(1, "blas"):  # on such small systems, threads mostly wait
-        shape = adjust_visible_times(
-            tracks.at(times), group.at(times), cameras.at(times), times, tuning
-        )
+    shape = adjust_visible_times(
+        tracks.at(times), group.at(times), cameras.at(times), times, tuning
+    )
     return replace(shape, group=shape.group.over_all_times(times, group.known))
 
 

@@ -13,8 +13,9 @@ from itertools import combinations
 
 import numpy as np
 from scipy.sparse import csr_matrix
+from threadpoolctl import threadpool_limits
 
-from hdr_nsff.core.progress import track
+from hdr_nsff.core.parallel import map_in_threads
 from hdr_nsff.priors.movers.bundle import MoverShape, adjust_bundle
 from hdr_nsff.priors.movers.bundle_problem import BundleProblem, BundleState, Cameras
 from hdr_nsff.priors.movers.rigid_groups import (
@@ -47,7 +48,8 @@ def segment_tracks(
     """The movers among the tracks, largest first."""
     graph = neighbor_graph(tracks, tuning.groups)
     groups = find_rigid_groups(tracks, graph, min_piece_share(tuning), tuning.groups)
-    return refine_segments(tracks, graph, [group.members for group in groups], cameras, tuning)
+    with threadpool_limits(1, "blas"):  # on such small systems, its threads mostly wait
+        return refine_segments(tracks, graph, [group.members for group in groups], cameras, tuning)
 
 
 def min_piece_share(tuning: MoversTuning) -> float:
@@ -94,11 +96,12 @@ def fit_segments(
     tuning: MoversTuning = MOVERS_TUNING,
 ) -> list[Segment]:
     """Segments of the members in `groups`; those that hardly changed are `known`."""
-    segments = []
-    for members in track(groups, "movers"):
+
+    def segment_of(members: np.ndarray) -> Segment:
         same = [s for s in known if same_members(s.members, members, tuning)]
-        segments.append(same[0] if same else fit_segment(tracks, members, cameras, tuning))
-    return segments
+        return same[0] if same else fit_segment(tracks, members, cameras, tuning)
+
+    return map_in_threads(segment_of, groups, "movers")
 
 
 def fit_segment(
