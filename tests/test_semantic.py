@@ -9,12 +9,12 @@ import torch
 from hdr_nsff.priors.flow.adapt import cell_colors
 from hdr_nsff.priors.flow.dense import dense_flow
 from hdr_nsff.priors.flow.features import Features
+from hdr_nsff.priors.flow.joint_bilateral import joint_bilateral_mean
 from hdr_nsff.priors.flow.semantic import (
     SemanticFlow,
     coarse_flow,
     equal_exposure_tracks,
     fill_cells,
-    joint_bilateral_mean,
     match_features,
 )
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from hdr_nsff.core.io import read_npy
 from hdr_nsff.core.parallel import map_in_threads
-from hdr_nsff.core.stack import ArrayStack
+from hdr_nsff.core.stack import ArrayStack, RecentArrays, Stack
 from hdr_nsff.geometry.round_trip import RoundTripTuning, valid_flow
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.steps.flow import Pair, flow_files, flow_is_given, stored, write_flow
@@ -27,6 +27,8 @@ from hdr_nsff.priors.flow.masked_least_squares import (
 from hdr_nsff.radiometry.common_range import common_gray, common_rgb, recorded_range
 from hdr_nsff.radiometry.one_exposure import at_one_exposure
 from hdr_nsff.scene.response import read_response
+
+VIDEO_MEMORY = 256 << 20  # bytes of frames at one exposure that are kept
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,9 @@ def equalized(work: Work) -> tuple[ArrayStack, str]:
     cameras = np.array([f.camera_id for f in m.frames])
     drift = np.array([f.drift or 0.0 for f in m.frames])
     video = at_one_exposure(work.video, brackets, cameras, response, drift)
-    return video, "on frames at one exposure through the response"
+    recent = RecentArrays(VIDEO_MEMORY)
+    kept = Stack(lambda t: recent.get(t, lambda: video[t]), video.shape)
+    return kept, "on frames at one exposure through the response"
 
 
 class Refiner:
@@ -104,7 +108,9 @@ class Refiner:
 
     def predict_both_directions(self, i: int, j: int) -> list[tuple[Pair, np.ndarray, np.ndarray]]:
         """((from, to), flow (H, W, 2) px, valid (H, W)) of the pair, there and back."""
-        there, back = self.least_squares(i, j), self.least_squares(j, i)
+        here_rgb, there_rgb = common_rgb(self.video, self.ranges, i, j)
+        there = self.least_squares(i, j, here_rgb, there_rgb)
+        back = self.least_squares(j, i, there_rgb, here_rgb)
         tolerance = self.tuning.round_trip
         valid_there = valid_flow(there, back, self.clipped[i], self.clipped[j], tolerance)
         valid_back = valid_flow(back, there, self.clipped[j], self.clipped[i], tolerance)
@@ -127,10 +133,12 @@ class Refiner:
             ((j, i), average_with_reverse(back, there), valid_back),
         ]
 
-    def least_squares(self, i: int, j: int) -> np.ndarray:
-        """Flow (H, W, 2) px from frame `i` to `j`, refined inside the moving mask."""
+    def least_squares(self, i: int, j: int, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+        """Flow (H, W, 2) px from frame `i` to `j`, refined inside the moving mask.
+
+        `source` and `target` (H, W, 3) are those frames, cut to their common range.
+        """
         files = self.work.manifest.frames[i].raw_flow[j]
         matched = read_npy(self.work.folder / files.flow).astype(np.float32)
-        pictures = common_rgb(self.video, self.ranges, i, j)
         unclipped = self.moving[i] & ~self.clipped[i]
-        return refine_mover_flow(*pictures, matched, unclipped, self.tuning.least_squares)
+        return refine_mover_flow(source, target, matched, unclipped, self.tuning.least_squares)

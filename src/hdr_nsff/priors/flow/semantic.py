@@ -48,10 +48,10 @@ from hdr_nsff.priors.flow.features import (
     check_xfeat,
     feature_source,
 )
+from hdr_nsff.priors.flow.joint_bilateral import joint_bilateral_mean
 from hdr_nsff.radiometry.common_range import common_gray
 
 DINOV2_STEPS = 300  # of fitting to a clip where no number is given; XFeat gained nothing by any
-MAX_COLOR_EXPONENT = 20.0  # keeps the weight of unlike cells above zero, so that none is empty
 
 Pairs = Sequence[tuple[int, int]]
 
@@ -315,46 +315,6 @@ def upsample_motion(
         tuning.color_sigma,
     )
     return mean
-
-
-def joint_bilateral_mean(
-    values: np.ndarray,
-    valid: np.ndarray,
-    cell_rgb: np.ndarray,
-    positions: np.ndarray,
-    rgb: np.ndarray,
-    radius: int,
-    color_sigma: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """The mean (H, W, C) of `values` of cells around `positions`, and its weight.
-
-    A cell counts by its distance, at most about `radius` cells, and by the likeness of
-    its `cell_rgb` (h, w, 3) to `rgb` (H, W, 3) (joint bilateral upsampling, Kopf et al.
-    2007). Only `valid` (h, w) cells enter, so no value from beyond an edge is mixed in.
-    `values` are (h, w, C), `positions` (H, W, 2) in cells; the mean and its weight (H,
-    W) are 0 where no cell counts.
-    """
-    h, w = valid.shape
-    size = positions.shape[:2]
-    nearest = np.rint(positions).astype(int)
-    total = np.zeros((*size, values.shape[-1]), np.float32)
-    weights = np.zeros(size, np.float32)
-    for dy in range(-radius, radius + 1):
-        for dx in range(-radius, radius + 1):
-            x = nearest[..., 0] + dx
-            y = nearest[..., 1] + dy
-            inside = (x >= 0) & (y >= 0) & (x < w) & (y < h)
-            x = x.clip(0, w - 1)
-            y = y.clip(0, h - 1)
-            distance = ((np.stack([x, y], -1) - positions) ** 2).sum(-1) / (radius / 2) ** 2
-            unlike = ((cell_rgb[y, x] - rgb) ** 2).sum(-1) / color_sigma**2
-            exponent = distance + np.minimum(unlike, MAX_COLOR_EXPONENT)
-            weight = np.where(inside & valid[y, x], np.exp(-0.5 * exponent), 0)
-            weight = weight.astype(np.float32)
-            # values of invalid cells may be NaN: never multiplied by 0
-            total += np.where(weight[..., None] > 0, weight[..., None] * values[y, x], 0)
-            weights += weight
-    return total / np.maximum(weights, 1e-12)[..., None], weights
 
 
 def equal_exposure_tracks(
