@@ -4,7 +4,13 @@ import numpy as np
 from posed_planes import H, W, cameras_at, oblique, posed_video
 
 from hdr_nsff.geometry.pinhole import pixel_centers
-from hdr_nsff.priors.depth.fuse import FuseTuning, joint_median, vote, warp_disparity
+from hdr_nsff.priors.depth.fuse import (
+    FuseTuning,
+    joint_median,
+    vote,
+    warp_disparity,
+    weighted_median,
+)
 
 TUNING = FuseTuning()
 
@@ -49,6 +55,22 @@ def test_the_vote_is_the_mean_of_those_near_the_weighted_median():
     weights = np.array([1, 1, 1, 2.5], np.float32).reshape(4, 1, 1)
     fused, agreeing, total = vote(disparities, weights, TUNING.max_disparity_difference)
     assert np.isclose(fused[0, 0], 1.01) and agreeing[0, 0] == 3 and total[0, 0] == 5.5
+
+
+def test_the_weighted_median_is_that_of_sorted_values():
+    """Equal values and weights of zero included; weights are whole, so that sums are
+    exact.
+    """
+    rng = np.random.default_rng(0)
+    for _ in range(500):
+        n = rng.integers(1, 40)
+        values = rng.integers(0, rng.integers(1, 60), n).astype(np.float32)
+        weights = rng.integers(0, 4, n).astype(np.float32)
+        weights[rng.integers(n)] = 1
+        order = np.argsort(values)
+        reached = np.cumsum(weights[order]) >= 0.5 * weights.sum()
+        expected = values[order][reached.argmax()]
+        assert weighted_median(values, weights, weights.sum()) == expected
 
 
 def test_cleaning_moves_a_depth_edge_onto_the_image_edge():

@@ -10,6 +10,7 @@ from hdr_nsff.priors.depth.plane_sweep import (
     PlaneSweepTuning,
     aggregate,
     box,
+    correlation_cost,
     mean_of_lowest,
     warp,
 )
@@ -36,6 +37,22 @@ def test_a_frame_is_read_where_a_turned_camera_sees_the_pixels():
     warp(gray, marks, *clip.transfer(0, 1), np.float32(0.25), warped, met)
     np.testing.assert_array_equal(met, np.where(inside, 0, OUTSIDE))
     np.testing.assert_allclose(warped[inside], (seen @ [1.0, 3.0])[inside], atol=0.01)
+
+
+def test_the_cost_is_one_minus_the_correlation_of_windows():
+    """Against numpy's correlation of each window, those at the borders too."""
+    rng, noise = np.random.default_rng(0), TUNING.noise_variance
+    gray, other = rng.random((2, 9, 11)).astype(np.float32)
+    mean, square, cost = np.empty((3, 9, 11), np.float32)
+    box(gray, 2, mean)
+    box(gray * gray, 2, square)
+    correlation_cost(gray, mean, square, other, 2, noise, cost)
+    for y in range(9):
+        for x in range(11):
+            window = np.s_[max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3]
+            (a, c), (_, b) = np.cov(gray[window].ravel(), other[window].ravel(), bias=True)
+            expected = 1 - c / np.sqrt((a + noise) * (b + noise))
+            assert np.isclose(cost[y, x], expected, atol=1e-4)
 
 
 def test_only_the_best_three_quarters_of_the_views_count():
