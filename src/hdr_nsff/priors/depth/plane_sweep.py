@@ -86,7 +86,7 @@ def warp(image, obstacles, rotation, shift, disparity, warped, met):
     """
     height, width = image.shape
     right, bottom = np.float32(width - 1), np.float32(height - 1)
-    half = np.float32(0.5)
+    half, nearest = np.float32(0.5), np.float32(1e-6)
     step_x, step_y = np.float32(rotation[0, 0]), np.float32(rotation[1, 0])
     step_q = np.float32(rotation[2, 0])
     column = np.empty(met.shape[1], np.float32)
@@ -97,14 +97,14 @@ def warp(image, obstacles, rotation, shift, disparity, warped, met):
         first = rotation[:, 0] * u + rotation[:, 1] * v + rotation[:, 2] + disparity * shift
         first_x, first_y = np.float32(first[0]), np.float32(first[1])
         first_q = np.float32(first[2])
-        for x in range(len(column)):
+        for x in range(len(column)):  # behind the camera is outside, too
             q = first_q + np.float32(x) * step_q
-            column[x] = (first_x + np.float32(x) * step_x) / q - half
-            if q <= np.float32(1e-6):
-                column[x] = -1  # outside
+            at = (first_x + np.float32(x) * step_x) / q - half
+            column[x] = at if q > nearest else np.float32(-1)
         for x in range(len(row)):
             q = first_q + np.float32(x) * step_q
-            row[x] = (first_y + np.float32(x) * step_y) / q - half
+            at = (first_y + np.float32(x) * step_y) / q - half
+            row[x] = at if q > nearest else np.float32(-1)
         for x in range(len(row)):
             px, py = column[x], row[x]
             inside = px >= 0 and py >= 0 and px <= right and py <= bottom
@@ -133,7 +133,7 @@ def correlation_cost(gray, mean, square, other, radius, noise_variance, result):
     height, width = gray.shape
     columns = np.zeros((3, width + 2 * radius), np.float32)  # of rows y - radius to y + radius
     sums = np.empty((3, width), np.float32)  # over the window: other, its square, the product
-    share = 1 / window_counts(width, radius)  # of a pixel among those of a window's row
+    shares = pixel_shares(width, radius)
     noise = np.float32(noise_variance)
     for y in range(-radius, height):
         if y + radius < height:
@@ -152,7 +152,7 @@ def correlation_cost(gray, mean, square, other, radius, noise_variance, result):
         rows = min(y, radius) + min(height - 1 - y, radius) + 1
         other_sum, square_sum, product_sum = sums
         for x in range(width):
-            each = share[x] / np.float32(rows)
+            each = shares[x] / np.float32(rows)
             other_mean = other_sum[x] * each
             variance = square[y, x] - mean[y, x] * mean[y, x] + noise
             other_variance = square_sum[x] * each - other_mean * other_mean + noise
@@ -162,12 +162,12 @@ def correlation_cost(gray, mean, square, other, radius, noise_variance, result):
 
 
 @jit(nogil=True, fastmath=True)
-def window_counts(size, radius):
-    """How many pixels of a row (`size`,) are within `radius` of each."""
-    counts = np.empty(size, np.float32)
+def pixel_shares(size, radius):
+    """The share (`size`,) of one pixel among those of a row within `radius` of each."""
+    shares = np.empty(size, np.float32)
     for x in range(size):
-        counts[x] = min(x, radius) + min(size - 1 - x, radius) + 1
-    return counts
+        shares[x] = 1 / (min(x, radius) + min(size - 1 - x, radius) + 1)
+    return shares
 
 
 @jit(nogil=True, fastmath=True)
