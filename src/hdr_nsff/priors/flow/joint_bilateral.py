@@ -45,8 +45,7 @@ def add_cells(values, cell_rgb, positions, rgb, valid, radius, color_sigma, tota
     """Add weighted `values` (h, w, C) to `total` (H, W, C), and their weights to
     `weights` (H, W); for the arguments see `joint_bilateral_mean`.
     """
-    by_distance = np.float32(4 / radius**2)  # of half the radius
-    by_color = np.float32(1 / color_sigma**2)
+    variance = np.float32(color_sigma**2)
     for y in range(total.shape[0]):
         for x in range(total.shape[1]):
             u, v = positions[y, x, 0], positions[y, x, 1]
@@ -58,9 +57,9 @@ def add_cells(values, cell_rgb, positions, rgb, valid, radius, color_sigma, tota
                     unlike = np.float32(0)
                     for c in range(3):
                         unlike += (cell_rgb[i, j, c] - rgb[y, x, c]) ** 2
-                    exponent = min(unlike * by_color, np.float32(MAX_COLOR_EXPONENT))
-                    exponent += by_distance * ((j - u) ** 2 + (i - v) ** 2)
-                    weight = np.float32(math.exp(np.float32(-0.5 * exponent)))
+                    exponent = min(unlike / variance, np.float32(MAX_COLOR_EXPONENT))
+                    distance = (j - np.float64(u)) ** 2 + (i - np.float64(v)) ** 2
+                    weight = np.float32(math.exp(-0.5 * (distance / (radius / 2) ** 2 + exponent)))
                     weights[y, x] += weight
                     for c in range(total.shape[2]):
                         total[y, x, c] += weight * values[i, j, c]
