@@ -43,20 +43,24 @@ def test_each_direction_of_a_path_has_its_own_smoothness() -> None:
         assert scale == pytest.approx(1 / BUNDLE_TUNING.path_sigma)
 
 
-def test_the_path_jacobian_is_its_derivative() -> None:
+def test_the_terms_of_a_path_are_the_products_of_its_derivatives() -> None:
     problem, h = flat_problem(), 1e-6
     s = true_state(problem)
     noise = np.random.default_rng(0).normal(0, 0.05, s.translations.shape)
     s = replace(s, translations=s.translations + noise)
     problem.fit_path_whitening(s)
     path = path_residuals(problem, s)
-    jacobian = problem.path_jacobian(s, path)
-    for t, axis in ((0, 0), (5, 1), (TIMES - 1, 2)):
+    derivatives = np.empty((path.size, TIMES * 3))
+    for k in range(TIMES * 3):
         moved = s.translations.copy()
-        moved[t, axis] += h
-        measured = (path_residuals(problem, replace(s, translations=moved)) - path) / h
-        largest = np.abs(jacobian).max()
-        assert measured == pytest.approx(jacobian[:, :, t, axis], abs=1e-3 * largest)
+        moved[k // 3, k % 3] += h
+        change = path_residuals(problem, replace(s, translations=moved)) - path
+        derivatives[:, k] = change.reshape(-1) / h
+    matrix, gradient = problem.path_terms(s, path)
+    products = derivatives.T @ derivatives
+    np.testing.assert_allclose(matrix, products, atol=1e-3 * np.abs(products).max())
+    slopes = (derivatives.T @ path.reshape(-1)).reshape(TIMES, 3)
+    np.testing.assert_allclose(gradient, slopes, atol=1e-3 * np.abs(slopes).max())
 
 
 def test_only_the_prior_of_distance_changes_with_scale() -> None:

@@ -34,18 +34,41 @@ def adjust_bundle(
     group: RigidGroup,
     cameras: Cameras,
     tuning: BundleTuning = BUNDLE_TUNING,
+    near: RigidGroup | None = None,
 ) -> MoverShape:
     """The shape and motion that best explain the pixels of a group's tracks.
 
     Times before the first and after the last visible one, and in long gaps, are left
-    out of the solution, which they would only slow down, and interpolated.
+    out of the solution, which they would only slow down, and interpolated. `near` is
+    the adjusted motion of about the same tracks, known at all times of the group.
     """
     visible = (tracks.trust[group.members] > 0).any(0)
     times = times_of_solution(visible, tuning.max_gap_times)
-    shape = adjust_visible_times(
-        tracks.at(times), group.at(times), cameras.at(times), times, tuning
-    )
+    view, seen = tracks.at(times), cameras.at(times)
+    if near is not None:
+        start = replace(near, members=group.members, known=group.known)
+        shape = continue_adjustment(view, start.at(times), seen, times, tuning)
+    else:
+        shape = adjust_visible_times(view, group.at(times), seen, times, tuning)
     return replace(shape, group=shape.group.over_all_times(times, group.known))
+
+
+def continue_adjustment(
+    tracks: Tracks,
+    start: RigidGroup,
+    cameras: Cameras,
+    times: np.ndarray,
+    tuning: BundleTuning = BUNDLE_TUNING,
+) -> MoverShape:
+    """The shape of a group whose motion `start` was adjusted to other tracks of it:
+    depth is not reversed any more. The arguments are those of `adjust_visible_times`.
+    """
+    problem = problem_of(tracks, start, cameras, times, tuning)
+    if problem.usable.sum() < tuning.min_tracks:
+        return MoverShape(start, np.full((len(start.members), 3), np.nan), np.inf)
+    poses = BundleState(problem.start, start.rotations, start.translations)
+    state, _ = problem.minimize(problem.solve_points(poses), tuning.iterations)
+    return finish_adjustment(tracks, start, cameras, times, problem, state)
 
 
 def times_of_solution(visible: np.ndarray, max_gap: int) -> np.ndarray:
@@ -72,30 +95,50 @@ def adjust_visible_times(
     The solution starts from the group's motion and from its path without rotation; the
     better result counts.
     """
-    visible = tracks.trust[group.members] > 0
-    chosen = group.members[longest_tracks(visible, tuning.max_tracks)]
     solutions = []
     for start in (group, path_without_rotation(tracks, group, tuning)):
-        own = replace(start, members=chosen)
-        problem = BundleProblem(tracks, own, cameras, tuning, times)
+        problem = problem_of(tracks, start, cameras, times, tuning)
         if problem.usable.sum() < tuning.min_tracks:
             continue
         first = BundleState(problem.start, start.rotations, start.translations)
         state, cost = problem.minimize(first, tuning.iterations)
         solutions.append((cost, state, problem, start))
-    points = np.full((len(group.members), 3), np.nan)
     if not solutions:
-        return MoverShape(group, points, np.inf)
-
+        return MoverShape(group, np.full((len(group.members), 3), np.nan), np.inf)
     cost, state, problem, start = min(solutions, key=lambda solution: solution[0])
     state = undo_depth_reversals(problem, state, cost)
+    return finish_adjustment(tracks, start, cameras, times, problem, state)
+
+
+def problem_of(
+    tracks: Tracks, group: RigidGroup, cameras: Cameras, times: np.ndarray, tuning: BundleTuning
+) -> BundleProblem:
+    """The problem of the tracks that poses are estimated from."""
+    visible = tracks.trust[group.members] > 0
+    chosen = group.members[longest_tracks(visible, tuning.max_tracks)]
+    return BundleProblem(tracks, replace(group, members=chosen), cameras, tuning, times)
+
+
+def finish_adjustment(
+    tracks: Tracks,
+    start: RigidGroup,
+    cameras: Cameras,
+    times: np.ndarray,
+    problem: BundleProblem,
+    state: BundleState,
+) -> MoverShape:
+    """The shape of all tracks of the group `start`, from the `state` of a `problem` of
+    some: on a path as smooth as itself.
+    """
+    tuning = problem.tuning
     for _ in range(tuning.smoothness_rounds):
         problem.fit_path_whitening(state)
         state, _ = problem.minimize(state, tuning.iterations)
 
+    points = np.full((len(start.members), 3), np.nan)
     complete = BundleProblem(tracks, start, cameras, tuning, times)
     state = complete.solve_points(state)
-    points[complete.usable] = state.points + group.center
+    points[complete.usable] = state.points + start.center
     errors = np.linalg.norm(complete.reproject(state).error, axis=-1) / complete.noise
     return MoverShape(
         group=replace(start, rotations=state.rotations, translations=state.translations),

@@ -133,6 +133,10 @@ class BundleProblem:
         self.second_differences = differences(when, known, 2)  # (R, T)
         self.third_differences = differences(when, known, 3)  # (P, T)
         self.turn_differences = turn_differences(when, known)  # (R, T - 1)
+        # (T, T) products of the differences, which all steps share
+        self.path_products = self.third_differences.T @ self.third_differences
+        self.turn_products = self.second_differences.T @ self.second_differences
+        self.turn_products /= self.tuning.rotation_sigma_rad**2
         # makes third differences, as shares of z-depth, standard deviations
         self.path_whitening = np.eye(3) / self.tuning.initial_path_sigma  # (3, 3)
         min_tracks = self.tuning.min_tracks
@@ -173,11 +177,16 @@ class BundleProblem:
         self.depth_sigma = self.prior_distance * sigmas  # (T,)
 
     def minimize(self, state: BundleState, iterations: int) -> tuple[BundleState, float]:
-        """The state after at most `iterations` damped steps, and its cost."""
+        """The state after at most `iterations` damped steps, and its cost.
+
+        Steps end where two in a row have lowered the cost by little: after one, the
+        damping may have been too large.
+        """
         tuning = self.tuning
         cost = self.cost(state)
         damping = tuning.initial_damping
         equations: NormalEquations | None = None  # of the state
+        num_small = 0
         for _ in range(iterations):
             equations = equations or self.normal_equations(state)
             try:
@@ -186,11 +195,13 @@ class BundleProblem:
             except LinAlgError:  # more damping determines the step
                 candidate_cost = np.inf
             if candidate_cost < cost:
+                is_small = cost - candidate_cost < tuning.min_decrease * cost
+                num_small = num_small + 1 if is_small else 0
                 state, cost, equations = candidate, candidate_cost, None
                 damping /= tuning.damping_decrease
             else:
                 damping *= tuning.damping_increase
-            if damping > tuning.max_damping:
+            if damping > tuning.max_damping or num_small == 2:
                 break
         return state, cost
 
@@ -264,15 +275,23 @@ class BundleProblem:
         sigma = self.tuning.shape_sigma * self.size
         return sigma * self.distance(state) / self.prior_distance
 
-    def path_jacobian(self, state: BundleState, path: np.ndarray) -> np.ndarray:
-        """Derivatives (P, 3, T, 3) of the path's residuals by the translations.
+    def path_terms(self, state: BundleState, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The terms (3 T, 3 T) and (T, 3) of the path's residuals (P, 3), for the
+        translations.
 
         The residuals are shares of the distance. In scene units, every mover could
-        lower them by approaching the camera, since near movers move less.
+        lower them by approaching the camera, since near movers move less. The
+        derivative of one residual is (D W - path g) / distance with the differences D,
+        the whitening W, and the gradient g of the distance.
         """
-        by_path = self.third_differences[:, None, :, None] * self.path_whitening[:, None]
-        by_distance = path[..., None, None] * self.distance_gradient
-        return (by_path - by_distance) / self.distance(state)
+        whitening, gradient = self.path_whitening, self.distance_gradient
+        along = self.third_differences.T @ path @ whitening  # (T, 3)
+        squared = (path**2).sum()
+        matrix = np.kron(self.path_products, whitening.T @ whitening)
+        half = np.outer(along - 0.5 * squared * gradient, gradient)
+        matrix -= half + half.T
+        distance = self.distance(state)
+        return matrix / distance**2, (along - squared * gradient) / distance
 
     def fit_path_whitening(self, state: BundleState) -> None:
         """Set the prior's smoothness, per direction, to that of the state's path.
@@ -339,9 +358,8 @@ class BundleProblem:
         poses[np.arange(num), :, np.arange(num)] = pose_blocks
 
         # path
-        by_path = self.path_jacobian(state, priors.path).reshape(priors.path.size, 3 * num)
-        poses[:, 3:, :, 3:] += (by_path.T @ by_path).reshape(num, 3, num, 3)
-        path_gradient = (by_path.T @ priors.path.reshape(-1)).reshape(num, 3)
+        path_matrix, path_gradient = self.path_terms(state, priors.path)
+        poses[:, 3:, :, 3:] += path_matrix.reshape(num, 3, num, 3)
 
         # shape, whose standard deviation grows with the distance
         sigma = self.shape_sigma(state)
@@ -356,10 +374,10 @@ class BundleProblem:
         poses[:, 3:, :, 3:] += outer.reshape(num, 3, num, 3)
 
         # rotation
-        differences, rotation_sigma = self.second_differences, self.tuning.rotation_sigma_rad
         for axis in range(3):
-            poses[:, axis, :, axis] += differences.T @ differences / rotation_sigma**2
-        pose_gradient[:, :3] += differences.T @ priors.rotation / rotation_sigma
+            poses[:, axis, :, axis] += self.turn_products
+        by_turn = self.second_differences.T @ priors.rotation
+        pose_gradient[:, :3] += by_turn / self.tuning.rotation_sigma_rad
         return NormalEquations(
             poses=poses.reshape(6 * num, 6 * num),
             points=points,

@@ -72,13 +72,14 @@ def subtract_carried(
     Tracks that start at about the same time go together, so that short ones cost only
     the times at which they are `visible` (N, T).
     """
+    factors = np.swapaxes(np.linalg.cholesky(inverse), 1, 2)  # F_n, P_n = F_n^T F_n
     order = np.argsort(visible.argmax(1), kind="stable")
     for first in range(0, len(order), TRACKS_TOGETHER):
         chosen = order[first : first + TRACKS_TOGETHER]
         times = np.nonzero(visible[chosen].any(0))[0]
         if len(times):
             span = slice(6 * times[0], 6 * times[-1] + 6)
-            block = points_poses[chosen, :, span]
-            width = block.shape[2]
-            solved = (inverse[chosen] @ block).reshape(-1, width)
-            poses[span, span] -= block.reshape(-1, width).T @ solved
+            carried = factors[chosen] @ points_poses[chosen, :, span]
+            carried = carried.reshape(-1, carried.shape[2])
+            # numpy makes half of the product of a matrix with itself, and mirrors it
+            poses[span, span] -= carried.T @ carried

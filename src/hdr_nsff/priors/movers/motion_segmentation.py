@@ -8,6 +8,7 @@ groups are adjusted again.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -99,7 +100,7 @@ def fit_segments(
 
     def segment_of(members: np.ndarray) -> Segment:
         same = [s for s in known if same_members(s.members, members, tuning)]
-        return same[0] if same else fit_segment(tracks, members, cameras, tuning)
+        return same[0] if same else fit_segment(tracks, members, cameras, tuning, known)
 
     return map_in_threads(segment_of, groups, "movers")
 
@@ -109,15 +110,46 @@ def fit_segment(
     members: np.ndarray,
     cameras: Cameras,
     tuning: MoversTuning = MOVERS_TUNING,
+    known: Sequence[Segment] = (),
 ) -> Segment:
-    """The segment of `members`, with a shape where one of small error is found."""
+    """The segment of `members`, with a shape where one of small error is found.
+
+    Adjustment goes on from the `known` segment that has about the same members.
+    """
     group = fit_motion(tracks, members, tuning.groups)
     constants = tuning.segmentation
     few_tracks = len(members) < constants.min_shape_tracks
     if few_tracks or len(cameras.K) < constants.min_shape_times:
         return Segment(group, None)
-    shape = adjust_bundle(tracks, group, cameras, tuning.bundle)
+    near = nearly_same(tracks, group, known, tuning)
+    shape = adjust_bundle(tracks, group, cameras, tuning.bundle, near)
     return Segment(group, shape if shape.error < constants.max_error else None)
+
+
+def nearly_same(
+    tracks: Tracks,
+    group: RigidGroup,
+    known: Sequence[Segment],
+    tuning: MoversTuning = MOVERS_TUNING,
+) -> RigidGroup | None:
+    """The adjusted motion of the `known` segment that shares most members with a group.
+
+    None where none shares enough, or its motion is known for too little of the group's
+    life.
+    """
+    found: RigidGroup | None = None
+    constants = tuning.segmentation
+    most = constants.min_shared_members
+    for segment in known:
+        if segment.shape is None:
+            continue
+        motion = segment.shape.group
+        both = len(np.intersect1d(motion.members, group.members, assume_unique=True))
+        share = both / (len(motion.members) + len(group.members) - both)
+        known_share = motion.known[group.known].mean()
+        if share > most and known_share >= constants.min_shared_times:
+            found, most = motion, share
+    return found
 
 
 def merge_segments(
@@ -164,7 +196,7 @@ def merge_pair(
     """One segment for two, None where their own motions explain them better."""
     if not may_be_one_mover(tracks, a.group, b.group, tuning):
         return None
-    merged = fit_segment(tracks, np.union1d(a.members, b.members), cameras, tuning)
+    merged = fit_segment(tracks, np.union1d(a.members, b.members), cameras, tuning, (a, b))
     if merged.shape is None:
         return None
     constants = tuning.segmentation

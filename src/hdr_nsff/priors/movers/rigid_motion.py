@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from hdr_nsff.geometry.alignment import nearest_rotation
 from hdr_nsff.maths.differences import averaged_with_neighbors
+from hdr_nsff.priors.movers import rigid_kernels as kernels
 from hdr_nsff.priors.movers.tracks import Tracks
 from hdr_nsff.priors.movers.tuning import RIGID_GROUPS_TUNING, RigidGroupsTuning
 
@@ -137,18 +138,13 @@ def fit_rigid(
     fewer than `min_rotation_points`. Weights are of Geman-McClure type, with the median
     residual as scale.
     """
-    w = weight.copy()
-    for _ in range(tuning.robust_rounds):
-        total = w.sum() + 1e-12
-        a = (w[:, None] * source).sum(0) / total
-        b = (w[:, None] * target).sum(0) / total
-        rotation = np.eye(3)
-        if len(source) >= tuning.min_rotation_points:
-            rotation = nearest_rotation((w[:, None] * (target - b)).T @ (source - a))
-        translation = b - rotation @ a
-        residual = np.linalg.norm(source @ rotation.T + translation - target, axis=-1)
-        w = weight / (1 + (residual / (np.median(residual) + 1e-9)) ** 2)
-    return rotation, translation
+    return kernels.fit_rigid(
+        np.ascontiguousarray(source, np.float64),
+        np.ascontiguousarray(target, np.float64),
+        np.ascontiguousarray(weight, np.float64),
+        tuning.robust_rounds,
+        tuning.min_rotation_points,
+    )
 
 
 def canonical_points(

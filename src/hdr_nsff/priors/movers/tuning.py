@@ -169,6 +169,8 @@ class BundleTuning:
     """Factor by which damping grows after a step that does not."""
     max_damping: float = 1e6
     """Damping at which a solution has converged."""
+    min_decrease: float = 3e-4
+    """Share by which a step lowers the cost, below which it counts as small."""
     max_tracks: int = 200
     """Tracks that poses are estimated from."""
     max_gap_times: int = 12
@@ -266,6 +268,12 @@ class MotionSegmentationTuning:
     """Distance in the image at which an object may return, in its radii."""
     max_changed_share: float = 0.01
     """Groups of which a smaller share of tracks changed are not fitted again."""
+    min_shared_members: float = 0.7
+    """Share, of the members of two groups, that both have where the adjustment of one
+    goes on from that of the other.
+    """
+    min_shared_times: float = 0.95
+    """Share of a group's visible times at which the other's motion is known, then."""
 
 
 MOTION_SEGMENTATION_TUNING = MotionSegmentationTuning()
