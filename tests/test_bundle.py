@@ -23,6 +23,7 @@ from tumbling_body import (
     tracked,
 )
 
+from hdr_nsff.priors.movers import bundle
 from hdr_nsff.priors.movers.bundle import (
     MoverShape,
     adjust_bundle,
@@ -69,6 +70,31 @@ def test_relief_and_rotation_of_a_tumbling_body_are_found_from_a_flat_start() ->
     assert shape.error < 0.05 and relief_correlation(points).min() > 0.99
     assert rotation_errors(shape.group.rotations).max() < 0.3  # of steps of 6.1 degrees
     assert np.abs(points - TRUE).max() < 0.03
+
+
+def test_adjustment_goes_on_from_the_motion_of_nearly_the_same_tracks(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tracks, shape = adjusted()
+    most = np.arange(len(tracks.trust) * 4 // 5)
+    near = adjust_bundle(tracks, fit_motion(tracks, most), CAMERAS).group
+    monkeypatch.setattr(bundle, "undo_depth_reversals", None)  # would be called otherwise
+    group = fit_motion(tracks, np.arange(len(tracks.trust)))
+    found = adjust_bundle(tracks, group, CAMERAS, BUNDLE_TUNING, near)
+    assert found.error < 0.05 and abs(found.error - shape.error) < 1e-3
+    assert np.abs(points_of_shape(found) - TRUE).max() < 0.03
+    with pytest.raises(TypeError, match="NoneType"):
+        adjust_bundle(tracks, group, CAMERAS)
+
+
+def test_times_that_the_known_motion_lacks_are_adjusted_too() -> None:
+    tracks, _ = adjusted()
+    first = np.arange(TIMES - 2)
+    group = fit_motion(tracks, np.arange(len(tracks.trust)))
+    seen = tracks.at(first), group.at(first), CAMERAS.at(first)
+    near = adjust_bundle(*seen).group.over_all_times(first, group.known)
+    found = adjust_bundle(tracks, group, CAMERAS, BUNDLE_TUNING, near)
+    assert found.error < 0.05 and rotation_errors(found.group.rotations).max() < 0.3
 
 
 @pytest.mark.parametrize("far", [0.8, 1.15])

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hdr_nsff.priors.movers.bundle import adjust_bundle
+from hdr_nsff.priors.movers.bundle import MoverShape, adjust_bundle
 from hdr_nsff.priors.movers.bundle_problem import Cameras
 from hdr_nsff.priors.movers.motion_segmentation import (
+    Segment,
     assign_tracks,
     may_be_one_mover,
     members_by_owner,
+    nearly_same,
     refine_segments,
     same_members,
     segment_tracks,
@@ -163,6 +165,23 @@ def test_a_hundredth_of_the_tracks_makes_no_other_group() -> None:
     before = np.arange(200)
     assert same_members(before, np.arange(2, 200))
     assert not same_members(before, np.arange(3, 200))
+
+
+def test_a_group_goes_on_from_the_motion_that_most_of_its_tracks_have() -> None:
+    tracks = crossing()
+    group = fit_motion(tracks, np.arange(COUNT))
+
+    def segment(first: int, last: int, known: np.ndarray = group.known) -> Segment:
+        own = replace(group, members=np.arange(first, last), known=known)
+        return Segment(own, MoverShape(own, np.zeros((last - first, 3)), 0.1))
+
+    nearest, near, other = segment(0, COUNT - 5), segment(20, COUNT), segment(0, COUNT // 2)
+    assert nearest.shape is not None
+    known = [near, nearest, other]
+    assert nearly_same(tracks, group, known) is nearest.shape.group
+    assert nearly_same(tracks, group, [other]) is None
+    assert nearly_same(tracks, group, [Segment(group, None)]) is None
+    assert nearly_same(tracks, group, [segment(0, COUNT, group.known & (T > 3))]) is None
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")

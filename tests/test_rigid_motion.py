@@ -7,6 +7,7 @@ import pytest
 from moving_bodies import TIMES, body, tracked
 from scipy.spatial.transform import Rotation
 
+from hdr_nsff.geometry.alignment import nearest_rotation
 from hdr_nsff.priors.movers.rigid_motion import fit_motion, fit_rigid
 from hdr_nsff.priors.movers.tuning import RIGID_GROUPS_TUNING
 
@@ -19,6 +20,22 @@ def test_a_rigid_fit_survives_a_third_of_wrong_points() -> None:
     tuning = replace(RIGID_GROUPS_TUNING, robust_rounds=30)
     rotation, translation = fit_rigid(source, target, np.ones(60), tuning)
     assert abs(rotation - r).max() < 1e-3 and abs(translation - [1, 2, 3]).max() < 1e-3
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01, 0.5, 3.0])
+def test_a_rigid_fit_is_a_reweighted_one_of_kabsch(noise: float) -> None:
+    rng = np.random.default_rng(1)
+    source, weight = rng.standard_normal((50, 3)), rng.uniform(0.1, 1, 50)
+    target = source @ Rotation.from_rotvec([1.2, -2.0, 0.6]).as_matrix().T + [1.0, 2.0, 3.0]
+    target += noise * rng.standard_normal((50, 3))
+    w = weight
+    for _ in range(RIGID_GROUPS_TUNING.robust_rounds):
+        a, b = np.average(source, 0, w), np.average(target, 0, w)
+        r = nearest_rotation((w[:, None] * (target - b)).T @ (source - a))
+        residual = np.linalg.norm(source @ r.T + b - r @ a - target, axis=-1)
+        w = weight / (1 + (residual / (np.median(residual) + 1e-9)) ** 2)
+    rotation, translation = fit_rigid(source, target, weight)
+    assert abs(rotation - r).max() < 1e-9 and abs(translation - (b - r @ a)).max() < 1e-9
 
 
 def test_a_rigid_fit_never_mirrors() -> None:

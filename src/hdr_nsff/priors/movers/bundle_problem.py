@@ -177,16 +177,11 @@ class BundleProblem:
         self.depth_sigma = self.prior_distance * sigmas  # (T,)
 
     def minimize(self, state: BundleState, iterations: int) -> tuple[BundleState, float]:
-        """The state after at most `iterations` damped steps, and its cost.
-
-        Steps end where two in a row have lowered the cost by little: after one, the
-        damping may have been too large.
-        """
+        """The state after at most `iterations` damped steps, and its cost."""
         tuning = self.tuning
         cost = self.cost(state)
         damping = tuning.initial_damping
         equations: NormalEquations | None = None  # of the state
-        num_small = 0
         for _ in range(iterations):
             equations = equations or self.normal_equations(state)
             try:
@@ -195,13 +190,11 @@ class BundleProblem:
             except LinAlgError:  # more damping determines the step
                 candidate_cost = np.inf
             if candidate_cost < cost:
-                is_small = cost - candidate_cost < tuning.min_decrease * cost
-                num_small = num_small + 1 if is_small else 0
                 state, cost, equations = candidate, candidate_cost, None
                 damping /= tuning.damping_decrease
             else:
                 damping *= tuning.damping_increase
-            if damping > tuning.max_damping or num_small == 2:
+            if damping > tuning.max_damping:
                 break
         return state, cost
 

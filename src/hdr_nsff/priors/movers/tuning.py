@@ -169,8 +169,6 @@ class BundleTuning:
     """Factor by which damping grows after a step that does not."""
     max_damping: float = 1e6
     """Damping at which a solution has converged."""
-    min_decrease: float = 3e-4
-    """Share by which a step lowers the cost, below which it counts as small."""
     max_tracks: int = 200
     """Tracks that poses are estimated from."""
     max_gap_times: int = 12
