@@ -28,7 +28,7 @@ def best_rotation(covariance):
     orientation using unit quaternions". It never mirrors.
     """
     c = covariance
-    form = np.empty((4, 4))
+    form = np.zeros((4, 4))
     form[0, 0] = c[0, 0] + c[1, 1] + c[2, 2]
     form[1, 1] = c[0, 0] - c[1, 1] - c[2, 2]
     form[2, 2] = c[1, 1] - c[0, 0] - c[2, 2]
