@@ -46,10 +46,12 @@ TRACK_TUNING = TrackTuning()
 class RigidityTuning:
     """Tuning constants of the test whether a mover is rigid."""
 
-    max_residual_ratio: float = 1.4
+    max_residual_ratio: float = 1.3
     """Residual of a rigid mover's flow relative to that of the static scene. Chosen on
     real clips and the demo: rendered boxes have 0.6 to 1.3 (2.4 before cameras that
-    jump), people 1.6 to 6.5, their raised arms alone 1.1 to 1.3."""
+    jump), people 1.6 to 6.5, their raised arms alone 1.1 to 1.5. An arm of 1.36 that
+    counts as rigid costs 0.6 dB on moving pixels, a car of 1.31 that does not 0.1 dB.
+    """
     max_shape_error: float = 0.25
     """Median distance of a rigid mover's tracks from its shape, in their standard
     deviations: rendered boxes have 0.06 to 0.15, pieces of a hammer 0.2, people and
