@@ -77,7 +77,7 @@ def test_adjustment_goes_on_from_the_motion_of_nearly_the_same_tracks(
 ) -> None:
     tracks, shape = adjusted()
     most = np.arange(len(tracks.trust) * 4 // 5)
-    near = adjust_bundle(tracks, fit_motion(tracks, most), CAMERAS).group
+    near = adjust_bundle(tracks, fit_motion(tracks, most), CAMERAS)
     monkeypatch.setattr(bundle, "undo_depth_reversals", None)  # would be called otherwise
     group = fit_motion(tracks, np.arange(len(tracks.trust)))
     found = adjust_bundle(tracks, group, CAMERAS, BUNDLE_TUNING, near)
@@ -92,7 +92,8 @@ def test_times_that_the_known_motion_lacks_are_adjusted_too() -> None:
     first = np.arange(TIMES - 2)
     group = fit_motion(tracks, np.arange(len(tracks.trust)))
     seen = tracks.at(first), group.at(first), CAMERAS.at(first)
-    near = adjust_bundle(*seen).group.over_all_times(first, group.known)
+    near = adjust_bundle(*seen)
+    near = replace(near, group=near.group.over_all_times(first, group.known))
     found = adjust_bundle(tracks, group, CAMERAS, BUNDLE_TUNING, near)
     assert found.error < 0.05 and rotation_errors(found.group.rotations).max() < 0.3
 

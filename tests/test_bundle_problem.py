@@ -178,3 +178,16 @@ def test_trust_in_depth_is_trust_that_gives_its_standard_deviation() -> None:
         assert tuning.sigma_of_depth(trust) == pytest.approx(sigma)
     assert tuning.sigma_of_depth(0.0) == tuning.depth_sigma
     assert float(tuning.trust_in_depth(np.array(1.0))) == tuning.untrusted_confidence
+
+
+def test_points_that_start_far_off_converge_too() -> None:
+    problem = flat_problem()
+    true = true_state(problem)
+    far = true.points + np.random.default_rng(0).normal(0, 3, true.points.shape)
+    problem.points_on_rays = lambda state: far  # type: ignore[method-assign]
+    found = problem.solve_points(true)
+    errors = np.linalg.norm(problem.reproject(found).error, axis=-1) / problem.noise
+    assert np.percentile(errors[problem.visible], 95) < 0.1
+    middle = np.median(far, 0)
+    start = problem.point_costs(replace(true, points=far), middle)
+    assert (problem.point_costs(found, middle) <= start).all()

@@ -176,9 +176,8 @@ def test_a_group_goes_on_from_the_motion_that_most_of_its_tracks_have() -> None:
         return Segment(own, MoverShape(own, np.zeros((last - first, 3)), 0.1))
 
     nearest, near, other = segment(0, COUNT - 5), segment(20, COUNT), segment(0, COUNT // 2)
-    assert nearest.shape is not None
     known = [near, nearest, other]
-    assert nearly_same(tracks, group, known) is nearest.shape.group
+    assert nearly_same(tracks, group, known) is nearest.shape
     assert nearly_same(tracks, group, [other]) is None
     assert nearly_same(tracks, group, [Segment(group, None)]) is None
     assert nearly_same(tracks, group, [segment(0, COUNT, group.known & (T > 3))]) is None

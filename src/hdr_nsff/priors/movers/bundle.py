@@ -34,41 +34,23 @@ def adjust_bundle(
     group: RigidGroup,
     cameras: Cameras,
     tuning: BundleTuning = BUNDLE_TUNING,
-    near: RigidGroup | None = None,
+    near: MoverShape | None = None,
 ) -> MoverShape:
     """The shape and motion that best explain the pixels of a group's tracks.
 
     Times before the first and after the last visible one, and in long gaps, are left
     out of the solution, which they would only slow down, and interpolated. `near` is
-    the adjusted motion of about the same tracks, known at all times of the group.
+    the shape of about the same tracks.
     """
     visible = (tracks.trust[group.members] > 0).any(0)
     times = times_of_solution(visible, tuning.max_gap_times)
     view, seen = tracks.at(times), cameras.at(times)
     if near is not None:
-        start = replace(near, members=group.members, known=group.known)
-        shape = continue_adjustment(view, start.at(times), seen, times, tuning)
+        known = replace(near, group=near.group.at(times))
+        shape = continue_adjustment(view, group.at(times), seen, times, known, tuning)
     else:
         shape = adjust_visible_times(view, group.at(times), seen, times, tuning)
     return replace(shape, group=shape.group.over_all_times(times, group.known))
-
-
-def continue_adjustment(
-    tracks: Tracks,
-    start: RigidGroup,
-    cameras: Cameras,
-    times: np.ndarray,
-    tuning: BundleTuning = BUNDLE_TUNING,
-) -> MoverShape:
-    """The shape of a group whose motion `start` was adjusted to other tracks of it:
-    depth is not reversed any more. The arguments are those of `adjust_visible_times`.
-    """
-    problem = problem_of(tracks, start, cameras, times, tuning)
-    if problem.usable.sum() < tuning.min_tracks:
-        return MoverShape(start, np.full((len(start.members), 3), np.nan), np.inf)
-    poses = BundleState(problem.start, start.rotations, start.translations)
-    state, _ = problem.minimize(problem.solve_points(poses), tuning.iterations)
-    return finish_adjustment(tracks, start, cameras, times, problem, state)
 
 
 def times_of_solution(visible: np.ndarray, max_gap: int) -> np.ndarray:
@@ -80,6 +62,33 @@ def times_of_solution(visible: np.ndarray, max_gap: int) -> np.ndarray:
         return np.arange(len(visible))
     parts = np.split(seen, np.nonzero(np.diff(seen) > max_gap + 1)[0] + 1)
     return np.concatenate([np.arange(part[0], part[-1] + 1) for part in parts])
+
+
+def continue_adjustment(
+    tracks: Tracks,
+    group: RigidGroup,
+    cameras: Cameras,
+    times: np.ndarray,
+    near: MoverShape,
+    tuning: BundleTuning = BUNDLE_TUNING,
+) -> MoverShape:
+    """The shape of a group, found from the one of nearly the same tracks.
+
+    Depth is not reversed again. The other arguments are those of
+    `adjust_visible_times`.
+    """
+    start = replace(near.group, members=group.members, known=group.known)
+    problem = problem_of(tracks, start, cameras, times, tuning)
+    if problem.usable.sum() < tuning.min_tracks:
+        return MoverShape(start, np.full((len(start.members), 3), np.nan), np.inf)
+    state = BundleState(problem.start, start.rotations, start.translations)
+    points = problem.points_on_rays(state)
+    known = np.full((len(tracks.trust), 3), np.nan)
+    known[near.group.members] = near.points - start.center
+    known = known[problem.members]
+    state = replace(state, points=np.where(np.isfinite(known), known, points))
+    state, _ = problem.minimize(state, tuning.iterations)
+    return finish_adjustment(tracks, start, cameras, times, problem, state)
 
 
 def adjust_visible_times(

@@ -86,9 +86,9 @@ class ReprojectionTerms:
 class BundleProblem:
     """Residuals of a state, their derivatives, and the minimization.
 
-    `usable` (members,) bool marks the tracks that have a point; all other arrays of N
-    points are of those. `times` (T,) are positions among the clip's, by default one
-    after the other: motion is smooth only between consecutive ones.
+    `usable` bool marks the members of the group that have a point; `members` and all
+    other arrays of N are of those. `times` (T,) are positions among the clip's, by
+    default one after the other: motion is smooth only between consecutive ones.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class BundleProblem:
         prior_points = tracks.points[group.members] - group.center
         start = canonical_points(prior_points, visible, group.rotations, group.translations)
         self.usable = np.isfinite(start[:, 0]) & (visible.sum(1) >= MIN_OBSERVATIONS)
-        members = group.members[self.usable]
+        members = self.members = group.members[self.usable]  # (N,)
         self.visible = visible[self.usable]  # (N, T)
         self.start = start[self.usable]  # (N, 3)
         self.pixels = np.nan_to_num(tracks.pixels[members])  # (N, T, 2)
@@ -199,21 +199,34 @@ class BundleProblem:
         return state, cost
 
     def solve_points(self, state: BundleState, iterations: int | None = None) -> BundleState:
-        """The same poses with this problem's points fitted to them.
+        """The same poses with this problem's points fitted to them, by damped steps.
 
         The points start from `points_on_rays`; `iterations` is that of the tuning
         without one.
         """
-        iterations = self.tuning.iterations if iterations is None else iterations
-        points = self.points_on_rays(state)
-        sigma = self.shape_sigma(state)
-        middle = np.median(points, 0)
+        tuning = self.tuning
+        iterations = tuning.iterations if iterations is None else iterations
+        state = replace(state, points=self.points_on_rays(state))
+        sigma, middle = self.shape_sigma(state), np.median(state.points, 0)
+        costs = self.point_costs(state, middle)
+        damping = np.full(len(costs), tuning.initial_damping)
         for _ in range(iterations):
-            terms = self.reprojection_terms(replace(state, points=points))
+            terms = self.reprojection_terms(state)
             hessian = terms.points + np.eye(3) / sigma**2
-            gradient = terms.point_gradient + (points - middle) / sigma**2
-            points = points - np.linalg.solve(hessian, gradient[..., None])[..., 0]
-        return replace(state, points=points)
+            hessian += damping[:, None, None] * hessian * np.eye(3)
+            gradient = terms.point_gradient + (state.points - middle) / sigma**2
+            moved = state.points - np.linalg.solve(hessian, gradient[..., None])[..., 0]
+            moved_costs = self.point_costs(replace(state, points=moved), middle)
+            better = moved_costs < costs
+            state = replace(state, points=np.where(better[:, None], moved, state.points))
+            costs = np.where(better, moved_costs, costs)
+            damping *= np.where(better, 1 / tuning.damping_decrease, tuning.damping_increase)
+        return state
+
+    def point_costs(self, state: BundleState, middle: np.ndarray) -> np.ndarray:
+        """The part of the cost (N,) that each point has, about the `middle` (3,)."""
+        distances = (state.points - middle) / self.shape_sigma(state)
+        return self.huber(self.reproject(state)).sum(1) + 0.5 * (distances**2).sum(1)
 
     def points_on_rays(self, state: BundleState) -> np.ndarray:
         """Median over time of canonical points (N, 3) at the z-depth of the center."""
@@ -304,14 +317,18 @@ class BundleProblem:
     def cost(self, state: BundleState) -> float:
         """Half the sum of squares of all residuals, with Huber's loss of the errors."""
         reprojection = self.reproject(state)
-        length = np.linalg.norm(reprojection.error, axis=-1) / self.noise
-        huber = np.where(length < 1, 0.5 * length**2, length - 0.5)[self.visible].sum()
+        huber = self.huber(reprojection)[self.visible].sum()
         priors = self.prior_residuals(state, reprojection.depth)
         squares = [
             (residual**2).sum()
             for residual in (priors.depth, priors.path, priors.rotation, priors.shape)
         ]
         return float(huber + 0.5 * sum(squares))
+
+    def huber(self, reprojection: Reprojection) -> np.ndarray:
+        """Huber's loss (N, T) of the errors, 0 where not visible."""
+        length = np.linalg.norm(reprojection.error, axis=-1) / self.noise
+        return np.where(length < 1, 0.5 * length**2, length - 0.5)
 
     def reprojection_terms(self, state: BundleState) -> ReprojectionTerms:
         """The Gauss-Newton terms of the reprojection errors alone."""

@@ -131,13 +131,13 @@ def nearly_same(
     group: RigidGroup,
     known: Sequence[Segment],
     tuning: MoversTuning = MOVERS_TUNING,
-) -> RigidGroup | None:
-    """The adjusted motion of the `known` segment that shares most members with a group.
+) -> MoverShape | None:
+    """The shape of the `known` segment that shares most members with a group.
 
     None where none shares enough, or its motion is known for too little of the group's
     life.
     """
-    found: RigidGroup | None = None
+    found: MoverShape | None = None
     constants = tuning.segmentation
     most = constants.min_shared_members
     for segment in known:
@@ -148,7 +148,7 @@ def nearly_same(
         share = both / (len(motion.members) + len(group.members) - both)
         known_share = motion.known[group.known].mean()
         if share > most and known_share >= constants.min_shared_times:
-            found, most = motion, share
+            found, most = segment.shape, share
     return found
 
 
