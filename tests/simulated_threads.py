@@ -6,6 +6,7 @@ A thread of the CPU goes on with the next thread of the block after one that end
 kernel without barriers needs one for a whole block, in place of one for each thread.
 """
 
+import os
 import sys
 import threading
 from collections import deque
@@ -96,6 +97,11 @@ def locked() -> threading.Lock:
 
 
 def take_turns() -> None:
-    """Let the simulator run blocks so from now on."""
+    """Let the simulator run blocks so from now on, on one core where the system allows:
+    to wake a thread on another one takes longer than what most of them do.
+    """
+    if hasattr(os, "sched_setaffinity"):
+        cores = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, {cores[os.getpid() % len(cores)]})
     kernel.BlockManager = Turns
     kernelapi.FakeCUDAShared = Shared

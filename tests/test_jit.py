@@ -30,18 +30,26 @@ print(cache_is_writable(), double(4), increment(4))
 """
 
 
-def run_kernels(folder: Path, **environment: str) -> tuple[str, str]:
+ENVIRONMENT = {
+    name: value
+    for name, value in os.environ.items()
+    if name not in ("XDG_CACHE_HOME", "NUMBA_CACHE_DIR")
+}
+
+
+def run_kernels(folder: Path, kernels: str = KERNELS, **environment: str) -> tuple[str, str]:
     """Output and errors of the kernels in a copy of `core/jit.py`, in a new process."""
     for name in ("__init__.py", "core/__init__.py", "core/jit.py", "core/progress.py"):
         target = folder / "hdr_nsff" / name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(PACKAGE / name, target)
-    (folder / "kernels.py").write_text(KERNELS)
-    kept = {k: v for k, v in os.environ.items() if k not in ("XDG_CACHE_HOME", "NUMBA_CACHE_DIR")}
-    environment = kept | {"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"} | environment
+    source = folder / "kernels.py"
+    if not source.exists() or source.read_text() != kernels:
+        source.write_text(kernels)  # a new one is compiled anew
+    own = {"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
     ended = subprocess.run(
-        [sys.executable, folder / "kernels.py"],
-        env=environment,
+        [sys.executable, source],
+        env=ENVIRONMENT | own | environment,
         capture_output=True,
         text=True,
         check=True,
@@ -74,6 +82,17 @@ def test_without_a_writable_folder_kernels_are_compiled_and_it_is_said_once(
     assert "set NUMBA_CACHE_DIR to a writable folder" in " ".join(error.split())
 
 
+def test_compiling_for_long_is_said_once_and_not_where_the_cache_has_it(tmp_path: Path) -> None:
+    impatient = "import hdr_nsff.core.jit\nhdr_nsff.core.jit.LONG_SECONDS = 0.0\n" + KERNELS
+    output, error = run_kernels(tmp_path, impatient)
+    assert output == "True 8 5\n"
+    assert error.count("\n") == error.count("compiling kernels") == 1
+    assert run_kernels(tmp_path, impatient) == (output, "")
+    shutil.rmtree(tmp_path / "__pycache__")
+    _, error = run_kernels(tmp_path, impatient, HOME=block_caches(tmp_path))
+    assert "compiling kernels" not in error and "compiling without a cache" in error
+
+
 def test_the_folder_that_the_message_names_is_used(tmp_path: Path) -> None:
     home = block_caches(tmp_path)
     cache = tmp_path / "cache"
@@ -92,7 +111,7 @@ def test_a_changed_function_is_changed_in_its_callers_in_other_files(tmp_path: P
     (tmp_path / "kernels.py").write_text(caller)
 
     def run() -> str:
-        environment = os.environ | {"PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
+        environment = ENVIRONMENT | {"PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
         command = [sys.executable, tmp_path / "kernels.py"]
         return subprocess.run(
             command, env=environment, capture_output=True, check=True

@@ -9,14 +9,51 @@ compiles without a cache, which costs about a minute at every start.
 
 from __future__ import annotations
 
+import multiprocessing
+import time
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numba
+from numba.core import event
 
 from hdr_nsff.core.progress import say
+
+LONG_SECONDS = 2.0  # of compiling, from which on it is reported
+
+
+class CompilationReport(event.Listener):
+    """Reports once that kernels are being compiled, where that takes long: a first run
+    seems to stand still meanwhile.
+    """
+
+    def __init__(self) -> None:
+        self.depth = 0  # of kernels within kernels
+        self.begun = 0.0
+        self.seconds = 0.0
+        self.is_said = multiprocessing.parent_process() is not None
+
+    def on_start(self, event: event.Event) -> None:
+        """Start the clock with the outermost kernel."""
+        if self.depth == 0:
+            self.begun = time.monotonic()
+        self.depth += 1
+
+    def on_end(self, event: event.Event) -> None:
+        """Say it where compiling has taken long."""
+        self.depth -= 1
+        seconds = self.seconds + time.monotonic() - self.begun
+        if self.depth == 0:
+            self.seconds = seconds
+        if seconds > LONG_SECONDS and not self.is_said:
+            self.is_said = True
+            say("compiling kernels, which later runs find compiled: a minute or two")
+
+
+REPORT = CompilationReport()
+event.register("numba:compile", REPORT)
 
 
 def jit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -62,6 +99,7 @@ def stamp_of(folder: Path) -> tuple[tuple[str, int, int], ...]:
 @cache
 def report_missing_cache() -> None:
     """Say once that kernels are compiled at every start, and how to change that."""
+    REPORT.is_said = True
     say(
         "compiling without a cache (no writable folder for numba's); "
         "set NUMBA_CACHE_DIR to a writable folder"
