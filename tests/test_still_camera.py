@@ -1,5 +1,7 @@
 """A camera that stands still is recognized, whatever moves before it."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -180,6 +182,27 @@ def test_what_has_no_other_poses_may_shake_a_little(tmp_path, monkeypatch):
     assert poses.notes[0] == "treated as a camera that stands still, since nothing matches"
     with pytest.raises(InputError, match="nothing matches"):
         estimate_poses(panning(np.linspace(-30, 30, NUM)), None, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("share", "count", "rests"), [(0.6, 19, True), (0.6, 200, False), (0.4, 19, False)]
+)
+def test_a_turn_that_explains_much_counts_for_more_than_few_points(
+    share, count, rests, tmp_path, monkeypatch
+):
+    """Two people hide most of what a shaken camera sees: their parallax is none."""
+    angles = np.linspace(-12, 12, NUM)
+    found = replace(estimate_poses(panning(angles), None, tmp_path), parallax="full")
+    found = replace(found, points=np.ones((count, 3)), notes=("mapped",))
+    monkeypatch.setattr(estimate, "parallax_free_share", lambda *_: share)
+    monkeypatch.setattr(estimate.Mapper, "poses", lambda *_: found)
+    poses = estimate_poses(panning(angles), None, tmp_path)
+    assert (poses.parallax == "rotation") == rests
+    assert poses.notes[0] == (
+        "treated as a camera that turns in place, since structure from motion finds 19 points only"
+        if rests
+        else "mapped"
+    )
 
 
 def test_what_hardly_shows_a_background_or_moves_does_not_stand_nearly_still():

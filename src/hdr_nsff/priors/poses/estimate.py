@@ -66,6 +66,10 @@ class PosesTuning:
     # the same where structure from motion fails, or its masks keep changing
     # (hand-chosen)
     min_rotation_share_fallback: float = 0.5
+    # points below which structure from motion counts as failed where rotations explain
+    # that much, or the camera stands nearly still (a shaken camera behind two people:
+    # share 0.78 and 19 points that parallax seemed to place; 424 at least on others)
+    few_points: int = 100
     # the same behind a long lens, where a camera that slides past something flat sees a
     # turn, too (a painted wall behind boards: 0.80, a pan of 20 degrees: 0.97); with
     # less, structure from motion is tried first
@@ -104,14 +108,9 @@ def estimate_poses(
     frames. `readout` of a rolling shutter, in frames: cameras are then those of the
     middle rows; "auto" measures it. InputError where poses cannot be estimated.
     """
-    count = len(video)
-    if count < MIN_FRAMES:
-        raise InputError(
-            f"{count} frames are too few to estimate poses from; "
-            f"give at least {MIN_FRAMES}, or import poses (--poses)"
-        )
+    check_length(len(video))
     ignore = union(video.shape[:3], masks, clipped)
-    cameras = camera_ids or [0] * count
+    cameras = camera_ids or [0] * len(video)
     groups = camera_groups(cameras)
     poses, share, is_one_camera = None, 0.0, views is None and len(groups) == 1
     if is_one_camera:
@@ -136,6 +135,9 @@ def estimate_poses(
             poses = mapper.poses(lens)
             if readout == "auto" and earlier.readout is None and not poses.lenses:
                 poses = mapper.with_measured_readout(poses)
+            if is_one_camera and len(poses.points) < tuning.few_points and not poses.lenses:
+                few = InputError(f"structure from motion finds {len(poses.points)} points only")
+                poses = unmapped_poses(few, share, video, ignore, clipped, tuning, lens) or poses
         except InputError as error:
             if is_one_camera:
                 poses = unmapped_poses(error, share, video, ignore, clipped, tuning, lens)
@@ -146,6 +148,15 @@ def estimate_poses(
     for note in poses.notes:
         say(f"poses: {note}")
     return poses
+
+
+def check_length(count: int) -> None:
+    """InputError where a clip of `count` frames is too short."""
+    if count < MIN_FRAMES:
+        raise InputError(
+            f"{count} frames are too few to estimate poses from; "
+            f"give at least {MIN_FRAMES}, or import poses (--poses)"
+        )
 
 
 def union(shape: tuple[int, ...], *masks: ArrayStack | None) -> np.ndarray:
