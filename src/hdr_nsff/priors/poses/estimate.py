@@ -68,7 +68,7 @@ class PosesTuning:
     min_rotation_share_fallback: float = 0.5
     # points below which structure from motion counts as failed where rotations explain
     # that much, or the camera stands nearly still (a shaken camera behind two people:
-    # share 0.78 and 19 points that parallax seemed to place; 424 at least on others)
+    # share 0.78, 19 points; 424 at least on rendered clips and two shots of a film)
     few_points: int = 100
     # the same behind a long lens, where a camera that slides past something flat sees a
     # turn, too (a painted wall behind boards: 0.80, a pan of 20 degrees: 0.97); with
