@@ -49,7 +49,7 @@ class CompilationReport(event.Listener):
             self.seconds = seconds
         if seconds > LONG_SECONDS and not self.is_said:
             self.is_said = True
-            say("compiling kernels, which later runs find compiled: a minute or two")
+            say("compiling kernels, once per installation; this takes a minute or two")
 
 
 REPORT = CompilationReport()
