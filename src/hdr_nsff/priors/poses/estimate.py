@@ -136,11 +136,11 @@ def estimate_poses(
             if readout == "auto" and earlier.readout is None and not poses.lenses:
                 poses = mapper.with_measured_readout(poses)
             if is_one_camera and len(poses.points) < tuning.few_points and not poses.lenses:
-                few = InputError(f"structure from motion finds {len(poses.points)} points only")
+                few = f"structure from motion finds {len(poses.points)} points only"
                 poses = unmapped_poses(few, share, video, ignore, clipped, tuning, lens) or poses
         except InputError as error:
             if is_one_camera:
-                poses = unmapped_poses(error, share, video, ignore, clipped, tuning, lens)
+                poses = unmapped_poses(str(error), share, video, ignore, clipped, tuning, lens)
             if poses is None:
                 raise
     if poses.lenses:
@@ -170,7 +170,7 @@ def union(shape: tuple[int, ...], *masks: ArrayStack | None) -> np.ndarray:
 
 
 def unmapped_poses(
-    error: InputError,
+    reason: str,
     share: float,
     video: ArrayStack,
     ignore: np.ndarray,
@@ -178,8 +178,9 @@ def unmapped_poses(
     tuning: PosesTuning,
     lens: LensChoice,
 ) -> Poses | None:
-    """Poses of one camera of which structure from motion says an `error`: of a turn in
-    place that explains a `share` of the matches, or at rest.
+    """Poses of one camera that structure from motion does not place, for a `reason`
+    that the note names: of a turn in place that explains a `share` of the matches, or
+    at rest.
 
     `video` (T, H, W, 3); `ignore` and `clipped` (T, H, W) bool. None where neither
     explains it.
@@ -191,7 +192,7 @@ def unmapped_poses(
         poses, motion = nearly_still_poses(video, clipped, tuning, lens), "stands still"
     if poses is None:
         return None
-    note = f"treated as a camera that {motion}, since {error}"
+    note = f"treated as a camera that {motion}, since {reason}"
     return replace(poses, notes=(note, *poses.notes))
 
 
